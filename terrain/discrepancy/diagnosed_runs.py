@@ -43,7 +43,7 @@ from terrain.errors import ConfigError, DataError
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
-from terrain.simulation.plants.planar import Ground, load_model_error, load_scatter, planar_ground
+from terrain.simulation.plants.planar import Ground, planar_ground, probe_error, spread_numbers
 from terrain.terramechanics.soil import extra_soil_names, load_soil, soil_names
 
 ACTS_RATIO = 0.25
@@ -248,19 +248,19 @@ def simulation_for(
     for label in labels:
         if label in known and drivable(robot, label):
             grounds[label] = planar_ground(robot, load_soil(label))
-    simulation = Simulation(robot, Ground(), robot.effects, load_scatter()._asdict(), grounds)
+    simulation = Simulation(robot, Ground(), robot.effects, spread_numbers("scatter"), grounds)
     if grounds:
-        parameters, error = parameters_of(robot.drive), load_model_error()
+        parameters = parameters_of(robot.drive)
         common, varied, scatter = (
-            {name: size for name, size in sizes.items() if name in parameters}
-            for sizes in (error.common, error.varied, error.scatter)
+            {name: size for name, size in spread_numbers(part).items() if name in parameters}
+            for part in ("model_error", "varied_error", "varied_scatter")
         )
         simulation = replace(
             simulation,
             model_error=common,
             varied_error=varied,
             varied_scatter=scatter,
-            probe_error=error.probes,
+            probe_error=probe_error(),
         )
     signals = [signals_of(run, robot) for run in runs] if grounds else []
     for label, ground in list(grounds.items()):

@@ -17,6 +17,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -68,8 +69,7 @@ class StreamMemory:
 Change = Callable[[Reading, StreamMemory, float], Reading | None]
 
 
-@dataclass(frozen=True, slots=True)
-class SensorFault:
+class SensorFault(NamedTuple):
     """An entry of the catalogue."""
 
     name: str  # of the fault, and of the group that it is in
@@ -125,41 +125,27 @@ class FaultyBus:
 
     def __call__(self, sample: Sample) -> Command:
         """Return the controller's command for what arrives of a sample."""
+        readings, fault, shift_s = dict(sample.readings), self._fault, self._fault.clock_s
         if sample.time_s < self._start_s:
-            for name, memory in self._memory.items():
-                if name in sample.readings:
-                    memory.last = sample.readings[name].values[-1].copy()
+            for name in self._memory.keys() & readings.keys():
+                self._memory[name].last = readings[name].values[-1].copy()
         elif sample.time_s < self._end_s:
-            sample = self._changed(sample)
-        else:
-            sample = self._released(sample)
-        return self._controller(sample)
-
-    def _changed(self, sample: Sample) -> Sample:
-        readings, shift_s = {}, self._fault.clock_s
-        for name in dict.fromkeys((*sample.readings, *self._fault.streams)):
-            given = sample.readings.get(name, _NOTHING)
-            if name in self._fault.streams:
-                memory, time_s = (
-                    self._memory[name],
-                    given.time_s + shift_s if shift_s else given.time_s.copy(),
-                )
-                changed = self._fault.change(Reading(time_s, given.values.copy()), memory, sample.time_s)
+            for name in fault.streams:
+                given, memory = readings.pop(name, _NOTHING), self._memory[name]
+                time_s = given.time_s + shift_s if shift_s else given.time_s.copy()
+                changed = fault.change(Reading(time_s, given.values.copy()), memory, sample.time_s)
                 memory.n_samples += len(given.time_s)
-                given = _NOTHING if changed is None else changed
-            if given.time_s is None or len(given.time_s):
-                readings[name] = given
-        return sample._replace(readings=readings, time_s=sample.time_s + shift_s)
-
-    def _released(self, sample: Sample) -> Sample:
-        """Return a sample with all that was held back before it, which is held back no more."""
-        readings = dict(sample.readings)
-        for stream, memory in self._memory.items():
-            if memory.pending:
-                held = [reading for _, reading in memory.pending]
-                readings[stream] = _joined([*held, *([readings[stream]] if stream in readings else [])])
-                memory.pending.clear()
-        return sample._replace(readings=readings)
+                if changed is not None and (changed.time_s is None or len(changed.time_s)):
+                    readings[name] = changed
+            sample = sample._replace(readings=readings, time_s=sample.time_s + shift_s)
+        else:  # with all that was held back before, which is held back no more
+            for name, memory in self._memory.items():
+                if memory.pending:
+                    late = [reading for _, reading in memory.pending]
+                    readings[name] = _joined([*late, *([readings[name]] if name in readings else [])])
+                    memory.pending.clear()
+            sample = sample._replace(readings=readings)
+        return self._controller(sample)
 
 
 _NOTHING = Reading(np.empty(0), np.empty((0, 0)))
@@ -182,13 +168,12 @@ def lost(reading: Reading, memory: StreamMemory, now_s: float) -> None:
     """Let nothing arrive."""
 
 
-def written(write: Callable[[Array, StreamMemory], object]) -> Change:
-    """Let a function write to all values (k, c)."""
+def written(write: Callable[[Array, StreamMemory], Any]) -> Change:
+    """Let a function write to all values (k, c), or return others in their place."""
 
     def change(reading: Reading, memory: StreamMemory, now_s: float) -> Reading:
-        if len(reading.time_s):
-            write(reading.values, memory)
-        return reading
+        values = write(reading.values, memory) if len(reading.time_s) else None
+        return reading if values is None else reading._replace(values=values)
 
     return change
 
@@ -197,16 +182,10 @@ def stamped(offset_s: float, chosen: bool = False) -> Change:
     """Add a time to all stamps, or to each tenth; a time that is not finite takes their place."""
 
     def change(reading: Reading, memory: StreamMemory, now_s: float) -> Reading:
-        at = _chosen(len(reading.time_s), memory) if chosen else slice(None)
-        reading.time_s[at] += offset_s
+        reading.time_s[_chosen(len(reading.time_s), memory) if chosen else slice(None)] += offset_s
         return reading
 
     return change
-
-
-def shaped(shape: Callable[[Reading], Reading]) -> Change:
-    """Give something of another shape or type in place of a reading."""
-    return lambda reading, memory, now_s: shape(reading) if len(reading.time_s) else None
 
 
 def late(delay_s: float, jitter_s: float = 0.0) -> Change:
@@ -254,8 +233,16 @@ def _chosen(n: int, memory: StreamMemory) -> Array:
     return np.asarray((memory.n_samples + np.arange(n)) % EVERY == EVERY - 1)
 
 
-def frozen(columns: Sequence[int] | slice = slice(None)) -> Change:
+def _columns(stream: str, start: str) -> list[int] | slice:
+    """Return the columns of a stream whose channels start with a word; all without a stream."""
+    return (
+        [i for i, name in enumerate(_CHANNELS[stream]) if name.startswith(start)] if stream else slice(None)
+    )
+
+
+def frozen(stream: str = "", start: str = "") -> Change:
     """Repeat the last values before the fault; stamps go on."""
+    columns = _columns(stream, start)
 
     def write(values: Array, memory: StreamMemory) -> None:
         values[:, columns] = _last_values(values, memory)[columns]
@@ -263,11 +250,12 @@ def frozen(columns: Sequence[int] | slice = slice(None)) -> Change:
     return written(write)
 
 
-def offset(columns: Sequence[int], amount: float) -> Change:
-    """Add a number to channels."""
+def scaled(stream: str, start: str, factor: float = 1.0, amount: float = 0.0) -> Change:
+    """Multiply channels by a number and add another."""
+    columns = _columns(stream, start)
 
     def write(values: Array, memory: StreamMemory) -> None:
-        values[:, columns] += amount
+        values[:, columns] = values[:, columns] * factor + amount
 
     return written(write)
 
@@ -277,15 +265,6 @@ def filled(value: float, chosen: bool = False) -> Change:
 
     def write(values: Array, memory: StreamMemory) -> None:
         values[_chosen(len(values), memory) if chosen else slice(None)] = value
-
-    return written(write)
-
-
-def noisy(std: Array) -> Change:
-    """Add white noise with standard deviations (c,) to the channels."""
-
-    def write(values: Array, memory: StreamMemory) -> None:
-        values += std * memory.rng.standard_normal(values.shape)
 
     return written(write)
 
@@ -330,38 +309,22 @@ def _freeze_camera_speed(values: Array, memory: StreamMemory) -> None:
     values[:, _VELOCITY] += (held_mps - speed_mps)[:, None] * forward
 
 
-def camera_turned(angle_rad: float) -> Change:
+def _turn_camera(values: Array, memory: StreamMemory) -> None:
     """Turn the camera's orientation to the left about the vertical; its velocity stays."""
-    w, up = math.cos(angle_rad / 2), math.sin(angle_rad / 2)
-
-    def write(values: Array, memory: StreamMemory) -> None:
-        x, y, z, scalar = values[:, _QUATERNION].T.copy()  # y is up
-        values[:, _QUATERNION] = np.column_stack(
-            [w * x + up * z, w * y + up * scalar, w * z - up * x, w * scalar - up * y]
-        )
-
-    return written(write)
-
-
-def _text(reading: Reading) -> Reading:
-    return reading._replace(values=np.full(reading.values.shape, "unknown"))
-
-
-def _ragged(reading: Reading) -> Reading:
-    rows = [[0.0] * (1 + k) for k in range(len(reading.time_s) + 1)]
-    return reading._replace(values=rows)  # type: ignore[arg-type]
+    w, up = math.cos(YAW_STEP_RAD / 2), math.sin(YAW_STEP_RAD / 2)
+    x, y, z, scalar = values[:, _QUATERNION].T.copy()  # y is up
+    turned = w * x + up * z, w * y + up * scalar, w * z - up * x, w * scalar - up * y
+    values[:, _QUATERNION] = np.column_stack(turned)
 
 
 def _of_width(n_columns: int) -> Change:
     """Give the samples of another robot, with that number of columns; those that are added are 0."""
 
-    def shape(reading: Reading) -> Reading:
-        values = np.zeros((len(reading.time_s), n_columns))
-        kept = min(n_columns, reading.values.shape[1])
-        values[:, :kept] = reading.values[:, :kept]
-        return reading._replace(values=values)
+    def write(values: Array, memory: StreamMemory) -> Array:
+        n_added = max(n_columns - values.shape[1], 0)
+        return np.pad(values[:, :n_columns], ((0, 0), (0, n_added)))
 
-    return shaped(shape)
+    return written(write)
 
 
 SPEED_STEP_MPS, MOTOR_FACTOR, PITCH_STEP_RAD, YAW_STEP_RAD = 0.3, 1.2, 0.2, 0.3
@@ -396,99 +359,106 @@ def fault_catalogue(robot: Robot) -> dict[str, SensorFault]:
     (('odometry',), 'lying')
     """
     dead, lying, tolerable, degraded = Nature
-    faults: dict[str, SensorFault] = {}
+    each, cam, some = "each", "odometry", f"of each {EVERY} samples one"
+    speed, late_by = f"forward speed {SPEED_STEP_MPS:g} m/s", "samples arrive{} {:g} ms after their stamps"
+    turned, times = f"orientation turned to the left by {YAW_STEP_RAD:g} rad", f"times {MOTOR_FACTOR:g}"
+    chance = f"{late_by.format(' up to', 1000 * JITTER_S)}, by chance"
+    noisy = f"noise {NOISE_FACTOR:g} times the described one is added"
 
-    def add(
-        name: str,
-        about: str,
-        stream: str,
-        nature: Nature,
-        change: Change,
-        kind: str = "",
-        clock_s: float = 0.0,
-    ) -> None:
-        streams = STREAMS if stream == "all" else (stream,)
-        nature = degraded if name in EITHER else nature
-        kind = kind or name.partition("_")[0]
-        faults[name] = SensorFault(name, kind, about, streams, nature, change, clock_s)
+    def spread(std: Array) -> Change:
+        return written(lambda values, memory: values + std * memory.rng.standard_normal(values.shape))
 
-    def each(kind: str, about: str, nature: Nature, change: Change, group: str = "") -> None:
-        for stream in STREAMS:
-            add(f"{kind}_{stream}", f"{stream}: {about}", stream, nature, change, group or kind)
+    def shaped(shape: Callable[[Reading], Reading]) -> Change:
+        """Give something of another shape or type in place of a reading."""
+        return lambda reading, memory, now_s: shape(reading) if len(reading.time_s) else None
 
-    each("loss", "no sample arrives", dead, lost)
-    add("loss_all", "no sample of any stream arrives", "all", dead, lost)
-    each("freeze", "all values repeat, stamps go on", dead, frozen())
-    add("freeze_all", "all values of all streams repeat", "all", dead, frozen())
-    held = written(_freeze_camera_speed)
-    add("freeze_camera_speed", "the forward speed repeats", "odometry", dead, held)
-    turning = frozen(_columns("odometry", "quaternion"))
-    add("freeze_camera_orientation", "the orientation repeats", "odometry", dead, turning)
-    for i in (1, 2, 3):
-        rate = frozen(_columns("wheels", f"motor_{i}"))
-        add(f"freeze_motor_{i}", f"the rate of motor {i} repeats", "wheels", dead, rate)
-    for name in ("gyro", "accel", "pitch"):
-        add(f"freeze_{name}", f"{name} repeats", "imu", dead, frozen(_columns("imu", name)))
-    angle = frozen(_columns("steering", "angle_1"))
-    add("freeze_steering_1", "steering angle 1 repeats", "steering", dead, angle)
-
-    for name, sign, word in (("", 1.0, "more"), ("_down", -1.0, "less")):
-        about = f"forward speed {SPEED_STEP_MPS:g} m/s {word}"
-        change = camera_speed_offset(sign * SPEED_STEP_MPS)
-        add(f"step_camera_speed{name}", about, "odometry", lying, change)
-    about = f"orientation turned to the left by {YAW_STEP_RAD:g} rad"
-    add("step_camera_yaw", about, "odometry", lying, camera_turned(YAW_STEP_RAD))
-
-    def faster(values: Array, memory: StreamMemory) -> None:
-        values[:, _columns("wheels", "motor_1")] *= MOTOR_FACTOR
-
-    add("step_motor_1", f"rate of motor 1 times {MOTOR_FACTOR:g}", "wheels", lying, written(faster))
-    for stream, start, name, amount, unit in (
+    words = written(lambda values, memory: np.full(values.shape, "unknown"))
+    ragged = written(lambda values, memory: [[0.0] * (1 + k) for k in range(len(values) + 1)])
+    nothing = shaped(lambda reading: Reading(None, None))  # type: ignore[arg-type]
+    twice = shaped(lambda reading: Reading(*(np.repeat(part, 2, axis=0) for part in reading)))
+    offsets = (
         ("imu", "pitch", "pitch", PITCH_STEP_RAD, "rad"),
         ("imu", "yaw", "yaw", YAW_STEP_RAD, "rad"),
         ("imu", "gyro_z", "gyro", GYRO_STEP_RADPS, "rad/s"),
         ("imu", "accel_x", "accel", ACCEL_STEP_MPS2, "m/s^2"),
         ("steering", "angle_1", "steering_1", STEERING_STEP_RAD, "rad"),
-    ):
-        change = offset(_columns(stream, start), amount)
-        add(f"step_{name}", f"{name} {amount:g} {unit} more", stream, lying, change)
-
-    tenth = f"of each {EVERY} samples one has values of"
-    each("nan", "all values are NaN", dead, filled(math.nan))
-    each("nan_some", f"{tenth} NaN", tolerable, filled(math.nan, chosen=True))
-    each("inf", "all values are infinite", dead, filled(math.inf))
-    each("minus_inf", "all values are -inf", dead, filled(-math.inf))
-    each("spikes", f"{tenth} {SPIKE:g}", tolerable, filled(SPIKE, chosen=True))
-    each("zeros", "all values are 0", lying, filled(0.0))
-    for stream, std in noise_std(robot).items():
-        about = f"{stream}: noise {NOISE_FACTOR:g} times the described one is added"
-        add(f"noise_{stream}", about, stream, degraded, noisy(NOISE_FACTOR * std))
-
-    each("text", "words in place of values", dead, shaped(_text))
-    nothing = shaped(lambda reading: Reading(None, None))  # type: ignore[arg-type]
-    each("none", "None in place of stamps and values", dead, nothing)
-    each("ragged", "rows of different lengths", dead, shaped(_ragged))
-    for stream, width in OTHER_WIDTH.items():
-        about = f"{stream}: samples of another robot, with {width} columns"
-        add(f"width_{stream}", about, stream, dead, _of_width(width))
-
-    for delay_s in LATE_S:
-        ms = f"{1000 * delay_s:g}"
-        each(f"late_{ms}ms", f"samples arrive {ms} ms after their stamps", tolerable, late(delay_s), "late")
-    about = f"samples arrive up to {1000 * JITTER_S:g} ms after their stamps, by chance"
-    each("jitter", about, tolerable, late(0.0, JITTER_S))
-    each("disorder", "of each two samples the later one arrives first", tolerable, out_of_order)
-    twice = shaped(lambda reading: Reading(*(np.repeat(part, 2, axis=0) for part in reading)))
-    each("duplicates", "each sample arrives twice", tolerable, twice)
-    each("behind", f"stamps are {1000 * BEHIND_S:g} ms behind", tolerable, stamped(-BEHIND_S))
-    each("stampless", "all stamps are NaN", dead, stamped(math.nan))
-    for text, ahead_s in (("1s", 1.0), ("1h", 3600.0)):
-        about = f"of each {EVERY} samples one is stamped {ahead_s:g} s ahead"
-        each(f"future_{text}", about, tolerable, stamped(ahead_s, chosen=True), "future")
-    for text, step_s in (("forward", 3600.0), ("back", -3600.0)):
-        each(f"clock_{text}", f"its clock steps by {step_s:g} s", tolerable, stamped(step_s), "clock")
+    )
+    clocks = {"clock_forward": 3600.0, "clock_back": -3600.0}
+    rows: list[tuple[str, str, Nature, str, Change]] = [
+        ("loss", each, dead, "no sample arrives", lost),
+        ("loss_all", "all", dead, "no sample of any stream arrives", lost),
+        ("freeze", each, dead, "all values repeat, stamps go on", frozen()),
+        ("freeze_all", "all", dead, "all values of all streams repeat", frozen()),
+        ("freeze_camera_speed", cam, dead, "the forward speed repeats", written(_freeze_camera_speed)),
+        ("freeze_camera_orientation", cam, dead, "the orientation repeats", frozen(cam, "quaternion")),
+        *(
+            (
+                f"freeze_motor_{i}",
+                "wheels",
+                dead,
+                f"the rate of motor {i} repeats",
+                frozen("wheels", f"motor_{i}"),
+            )
+            for i in (1, 2, 3)
+        ),
+        *((f"freeze_{n}", "imu", dead, f"{n} repeats", frozen("imu", n)) for n in ("gyro", "accel", "pitch")),
+        ("freeze_steering_1", "steering", dead, "steering angle 1 repeats", frozen("steering", "angle_1")),
+        ("step_camera_speed", cam, lying, f"{speed} more", camera_speed_offset(SPEED_STEP_MPS)),
+        ("step_camera_speed_down", cam, lying, f"{speed} less", camera_speed_offset(-SPEED_STEP_MPS)),
+        ("step_camera_yaw", cam, lying, turned, written(_turn_camera)),
+        (
+            "step_motor_1",
+            "wheels",
+            lying,
+            f"rate of motor 1 {times}",
+            scaled("wheels", "motor_1", MOTOR_FACTOR),
+        ),
+        *(
+            (f"step_{n}", stream, lying, f"{n} {by:g} {unit} more", scaled(stream, start, amount=by))
+            for stream, start, n, by, unit in offsets
+        ),
+        ("nan", each, dead, "all values are NaN", filled(math.nan)),
+        ("nan_some", each, tolerable, f"{some} has values of NaN", filled(math.nan, chosen=True)),
+        ("inf", each, dead, "all values are infinite", filled(math.inf)),
+        ("minus_inf", each, dead, "all values are -inf", filled(-math.inf)),
+        ("spikes", each, tolerable, f"{some} has values of {SPIKE:g}", filled(SPIKE, chosen=True)),
+        ("zeros", each, lying, "all values are 0", filled(0.0)),
+        *(
+            (f"noise_{stream}", stream, degraded, f"{stream}: {noisy}", spread(NOISE_FACTOR * std))
+            for stream, std in noise_std(robot).items()
+        ),
+        ("text", each, dead, "words in place of values", words),
+        ("none", each, dead, "None in place of stamps and values", nothing),
+        ("ragged", each, dead, "rows of different lengths", ragged),
+        *(
+            (f"width_{n}", n, dead, f"{n}: samples of another robot, with {width} columns", _of_width(width))
+            for n, width in OTHER_WIDTH.items()
+        ),
+        *(
+            (f"late_{1000 * by:g}ms", each, tolerable, late_by.format("", 1000 * by), late(by))
+            for by in LATE_S
+        ),
+        ("jitter", each, tolerable, chance, late(0.0, JITTER_S)),
+        ("disorder", each, tolerable, "of each two samples the later one arrives first", out_of_order),
+        ("duplicates", each, tolerable, "each sample arrives twice", twice),
+        ("behind", each, tolerable, f"stamps are {1000 * BEHIND_S:g} ms behind", stamped(-BEHIND_S)),
+        ("stampless", each, dead, "all stamps are NaN", stamped(math.nan)),
+        ("future_1s", each, tolerable, f"{some} is stamped 1 s ahead", stamped(1.0, chosen=True)),
+        ("future_1h", each, tolerable, f"{some} is stamped 3600 s ahead", stamped(3600.0, chosen=True)),
+    ]
+    for name, step_s in clocks.items():
         about = f"the clocks of all streams and of the steps step by {step_s:g} s"
-        add(f"clock_{text}_all", about, "all", degraded, written(lambda values, memory: None), clock_s=step_s)
+        rows.append((name, each, tolerable, f"its clock steps by {step_s:g} s", stamped(step_s)))
+        rows.append((f"{name}_all", "all", degraded, about, written(lambda values, memory: None)))
+    faults = {}
+    for group, stream, nature, about, change in rows:
+        kind = group if group in ("nan_some", "minus_inf") else group.partition("_")[0]
+        clock_s = clocks[group.removesuffix("_all")] if group.startswith("clock") and stream == "all" else 0.0
+        for one in STREAMS if stream == each else (stream,):
+            name, stated = (f"{group}_{one}", f"{one}: {about}") if stream == each else (group, about)
+            streams = STREAMS if stream == "all" else (one,)
+            made = degraded if name in EITHER else nature
+            faults[name] = SensorFault(name, kind, stated, streams, made, change, clock_s)
     return faults
 
 
@@ -508,10 +478,6 @@ def select_faults(catalogue: Mapping[str, SensorFault], names: Sequence[str]) ->
                 f"as {next(iter(catalogue))}"
             )
     return [fault for fault in catalogue.values() if not names or fault.name in names or fault.kind in names]
-
-
-def _columns(stream: str, *starts: str) -> list[int]:
-    return [i for i, channel in enumerate(_CHANNELS[stream]) if channel.startswith(starts)]
 
 
 def noise_std(robot: Robot) -> dict[str, Array]:

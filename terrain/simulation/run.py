@@ -21,7 +21,7 @@ import math
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -33,10 +33,6 @@ from terrain.extension import warn_outside
 from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, Command, RunLog, Sample, Stream
 from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot, load_robot
-from terrain.simulation.plants import car
-from terrain.simulation.plants.dynamic import run_dynamic
-from terrain.simulation.plants.planar import Ground, load_noise, load_scatter, planar_ground, run_planar
-from terrain.simulation.plants.tracks import TrackedGround, run_tracked
 from terrain.simulation.scenario import (
     NO_FAULTS,
     RATE_HZ,
@@ -45,11 +41,16 @@ from terrain.simulation.scenario import (
     Patch,
     Scenario,
     draw_conditions,
-    load_spread,
     make_scenario,
 )
 from terrain.simulation.sensors import Gnss, draw_imu_errors, imu_values, is_lost
 from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
+
+if TYPE_CHECKING:
+    from terrain.simulation.plants.car import CarDrive
+    from terrain.simulation.plants.car import Ground as CarGround
+    from terrain.simulation.plants.planar import Ground
+    from terrain.simulation.plants.tracks import TrackedGround
 
 COURSE = "course"  # A path over all terrains, in place of the name of one
 # Word for the IMU alone on a bench, in place of a scenario, and the terrain that goes with it.
@@ -59,8 +60,8 @@ SLIP = "slip"  # word for drives that take the wheels through their slips, for `
 
 def simulate(
     robot: Robot,
-    drive: Scenario | Array | car.CarDrive,
-    ground: Mapping[str, Soil] | Ground | TrackedGround | car.Ground,
+    drive: Scenario | Array | CarDrive,
+    ground: Mapping[str, Soil] | Ground | TrackedGround | CarGround,
     seed: int | np.random.SeedSequence,
     *,
     run_id: str = "run",
@@ -117,28 +118,27 @@ def simulate(
     (array([0.5, 0.5]), array([0.443, 0.   ]))
     """
     plant: Any
-    if isinstance(ground, Mapping):
+    if isinstance(ground, Mapping):  # a run does not load the kernels of other plants
+        from terrain.simulation.plants.dynamic import run_dynamic
+
         plant, source = run_dynamic, f"simulated, {getattr(drive, 'name', '')}"
         options["faults"] = faults
-    elif isinstance(ground, Ground):
-        plant, source = run_planar, "simulated, planar"
-    elif isinstance(ground, car.Ground):
-        plant, source = car.run_car, "terrain.simulation.car"
     else:
-        plant, source = run_tracked, "simulated, tracked"
+        from terrain.simulation.plants import car, planar, tracks
+
+        plant, source = tracks.run_tracked, "simulated, tracked"
+        if isinstance(ground, planar.Ground):
+            plant, source = planar.run_planar, "simulated, planar"
+        elif isinstance(ground, car.Ground):
+            plant, source = car.run_car, "simulated, car"
     options |= {"conditions": conditions or Conditions(), "effects": effects or {}}
     streams, labels = plant(robot, drive, ground, seed, **options)
-    if faults.camera_lost_s:
-        streams = {name: _seen(name, stream, faults) for name, stream in streams.items()}
+    for name in ("odometry", "pose") if faults.camera_lost_s else ():  # a closed loop has lost them already
+        if name in streams:
+            stream = streams[name]
+            seen = ~is_lost(stream.time_s, faults.camera_lost_s)
+            streams[name] = Stream(stream.time_s[seen], stream.values[seen], stream.channels)
     return RunLog(run_id, robot.name, {n: s for n, s in streams.items() if len(s) > 1}, labels, source)
-
-
-def _seen(name: str, stream: Stream, faults: Faults) -> Stream:
-    """Return a stream without the samples of a camera that is lost; a closed loop has lost them already."""
-    if name not in ("odometry", "pose"):
-        return stream
-    kept = ~is_lost(stream.time_s, faults.camera_lost_s)
-    return Stream(stream.time_s[kept], stream.values[kept], stream.channels)
 
 
 def simulate_run(
@@ -193,9 +193,22 @@ def simulate_run(
     if effects and scenario in (BENCH, SLIP):
         raise ConfigError(f"scenario {scenario!r} is simulated without effects: leave them out")
     if scenario == BENCH:
-        return _bench(robot, terrain, seed, number, duration_s)
+        if terrain != BENCH_TERRAIN:
+            raise ConfigError(
+                f"scenario {BENCH!r} is done on a bench: give the terrain {BENCH_TERRAIN!r}, not {terrain!r}"
+            )
+        hold_s = 5.0 if duration_s is None else duration_s / len(POSITIONS) - TURN_S
+        held = np.random.SeedSequence([seed, zlib.crc32(BENCH.encode()), number])
+        return six_positions_log(robot, held, hold_s=hold_s, run_id=run_id_of(terrain, BENCH, number))
     if scenario == SLIP:
-        _check_slip(terrain, duration_s, conditions, faults, gnss)
+        if terrain == COURSE:
+            raise ConfigError(f"scenario {SLIP!r} is driven on one terrain, not on 'course'")
+        if duration_s is not None or conditions not in (None, Conditions()) or gnss is not None:
+            raise ConfigError(
+                f"scenario {SLIP!r} draws its conditions: leave duration, grade, payload and gnss out"
+            )
+        if faults not in (None, NO_FAULTS):
+            raise ConfigError(f"scenario {SLIP!r} has no faults on purpose: leave the camera's loss out")
         run_id = run_id_of(load_soil(terrain).name, SLIP, number)
         return learning_run(robot, terrain, seed, number, run_id=run_id)
     if (terrain == COURSE) != (scenario == COURSE):
@@ -207,53 +220,32 @@ def simulate_run(
     if vary:
         rng = np.random.default_rng(drawn)
         soils = {name: scattered(soil, rng) for name, soil in soils.items()}
-        conditions = draw_conditions(load_spread(), rng, conditions)
+        conditions = draw_conditions(rng, conditions)
     planar = not isinstance(robot, SwerveRobot)
     if planar and terrain == COURSE:
         raise ConfigError(f"robot {robot.name}: scenario {COURSE!r} is for swerve robots")
     drive_seed = int(driven.generate_state(1)[0])
     drive = make_scenario(scenario, robot, list(soils), duration_s, seed=drive_seed)
-    ground: Mapping[str, Soil] | Ground | Soil = soils
+    ground: Any = soils
     options: dict[str, Any] = {"gnss": gnss}
     effects = effects or {}
     if planar:
         ground, options = soils[terrain], {}
         if not isinstance(robot, TrackedRobot) or ground.law != "janosi" or {**robot.effects, **effects}:
-            ground, options = planar_ground(robot, ground), _noise_of_run(robot, vary)
+            from terrain.simulation.plants.planar import planar_ground, spread_numbers
+
             if gnss is not None:
                 raise ConfigError(f"robot {robot.name}: its simulation has no receiver, leave gnss out")
+            scatter = spread_numbers("scatter")
+            if not vary:  # the scatter of its sensors stays
+                scatter |= {name: 0.0 for name in NUISANCES if name in PARAMETER and name not in SENSED_ONLY}
+            ground, options = planar_ground(robot, ground), {"scatter": scatter}
+            options |= {"noise": spread_numbers("noise"), "fixes": isinstance(robot, BicycleRobot)}
     options |= {"conditions": conditions, "faults": faults or NO_FAULTS, "effects": effects}
     run_id = run_id_of(terrain, scenario, number)
     run = simulate(robot, drive, ground, simulated, run_id=run_id, **options)
     warn_outside(run, robot)
     return run
-
-
-def _noise_of_run(robot: Robot, vary: bool) -> dict[str, Any]:
-    """Return what a run of the planar plant draws; the scatter of its sensors does not depend on ``vary``."""
-    scatter = load_scatter()
-    if not vary:
-        fixed = (name for name in NUISANCES if name in PARAMETER and name not in SENSED_ONLY)
-        scatter = scatter._replace(**dict.fromkeys(fixed, 0.0))
-    return {"scatter": scatter, "noise": load_noise(), "fixes": isinstance(robot, BicycleRobot)}
-
-
-def _check_slip(
-    terrain: str,
-    duration_s: float | None,
-    conditions: Conditions | None,
-    faults: Faults | None,
-    gnss: Gnss | None,
-) -> None:
-    """Refuse options of drives for learning slip, which draw all conditions."""
-    if terrain == COURSE:
-        raise ConfigError(f"scenario {SLIP!r} is driven on one terrain, not on 'course'")
-    if duration_s is not None or conditions not in (None, Conditions()) or gnss is not None:
-        raise ConfigError(
-            f"scenario {SLIP!r} draws its conditions: leave duration, grade, payload and gnss out"
-        )
-    if faults not in (None, NO_FAULTS):
-        raise ConfigError(f"scenario {SLIP!r} has no faults on purpose: leave the camera's loss out")
 
 
 def run_id_of(terrain: str, scenario: str, number: int) -> str:
@@ -271,26 +263,8 @@ def run_id_of(terrain: str, scenario: str, number: int) -> str:
 # assumed.
 TURN_S, CROOKED_RAD = 1.5, 0.03
 
-POSITIONS = (
-    # turns about body axes that bring one axis up after the other: z, -z, x, -x, y, -y
-    (0.0, 0.0),
-    (math.pi, 0.0),
-    (0.0, -math.pi / 2),
-    (0.0, math.pi / 2),
-    (math.pi / 2, 0.0),
-    (-math.pi / 2, 0.0),
-)
-"""Roll and pitch of the six positions."""
-
-
-def _bench(robot: Robot, terrain: str, seed: int, number: int, duration_s: float | None) -> RunLog:
-    if terrain != BENCH_TERRAIN:
-        raise ConfigError(
-            f"scenario {BENCH!r} is done on a bench: give the terrain {BENCH_TERRAIN!r}, not {terrain!r}"
-        )
-    hold_s = 5.0 if duration_s is None else duration_s / len(POSITIONS) - TURN_S
-    key = np.random.SeedSequence([seed, zlib.crc32(BENCH.encode()), number])
-    return six_positions_log(robot, key, hold_s=hold_s, run_id=run_id_of(terrain, BENCH, number))
+# Roll and pitch of the six positions: turns about body axes that bring z, -z, x, -x, y and -y up.
+POSITIONS = math.pi / 2 * np.array([(0, 0), (2, 0), (0, -1), (0, 1), (1, 0), (-1, 0)])
 
 
 def six_positions_log(
@@ -319,7 +293,7 @@ def six_positions_log(
     rng = np.random.default_rng(seed)
     crooked = CROOKED_RAD * rng.standard_normal((len(POSITIONS), 2))
     heading = rng.uniform(-math.pi, math.pi, len(POSITIONS))
-    held = Rotation.from_euler("ZYX", np.column_stack([heading, (np.array(POSITIONS) + crooked)[:, ::-1]]))
+    held = Rotation.from_euler("ZYX", np.column_stack([heading, (POSITIONS + crooked)[:, ::-1]]))
     begin_s = np.arange(len(POSITIONS)) * (hold_s + TURN_S)
     knots_s = np.column_stack([begin_s, begin_s + hold_s]).ravel()
     attitude = Slerp(knots_s, held[np.repeat(np.arange(len(POSITIONS)), 2)])
@@ -333,10 +307,8 @@ def six_positions_log(
     roll = np.arctan2(turned[:, 2, 1], turned[:, 2, 2])
     pitch = -np.arcsin(np.clip(turned[:, 2, 0], -1.0, 1.0))
     yaw = np.arctan2(turned[:, 1, 0], turned[:, 0, 0])
-    tilt = np.column_stack([roll, pitch])
-    errors = draw_imu_errors(sensors, n, rng)
-    values = imu_values(errors, slice(None), force, rate, tilt, np.unwrap(yaw) - yaw[0])
-    streams = {"imu": Stream(time_s, values, IMU_CHANNELS)}
+    true = np.column_stack([rate, force, roll, pitch, np.unwrap(yaw) - yaw[0]])
+    streams = {"imu": Stream(time_s, imu_values(true, *draw_imu_errors(sensors, n, rng)), IMU_CHANNELS)}
     return RunLog(run_id, robot.name, streams, source="simulated, six positions on a bench")
 
 
@@ -390,7 +362,7 @@ def learning_run(
         {nominal.name: soil},
         simulated,
         run_id=run_id or f"{nominal.name}_{drive.kind}_{number:02d}",
-        conditions=draw_conditions(load_spread(), rng, ground),
+        conditions=draw_conditions(rng, ground),
         controller=SlipSweep(robot) if drive.kind == "sweep" else None,
     )
 

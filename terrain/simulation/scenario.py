@@ -13,8 +13,9 @@ backward, in both directions; the order and the speeds are assumed).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -95,39 +96,7 @@ class Leg(NamedTuple):
     accel_mps2: float = ACCEL_MPS2
 
 
-_STAND = Leg(AT_REST, STAND_S)
-
-
-class DriveRequest(NamedTuple):
-    """What every drive is made from; ``limit`` shortens a twist to what the robot can."""
-
-    name: str
-    speed_mps: float
-    limit: Callable[[Any], Array]
-    rng: np.random.Generator
-    accel_mps2: float
-    sideways: bool
-
-    @property
-    def ahead(self) -> Array:
-        """The twist at the speed straight ahead."""
-        return self.limit((self.speed_mps, 0.0, 0.0))
-
-    @property
-    def around(self) -> Array:
-        """The twist of ``circle``."""
-        speed_mps = min(self.speed_mps, CIRCLE_MPS)
-        return self.limit((speed_mps, 0.0, speed_mps / CIRCLE_M))
-
-    def remaining_s(self, length_s: float, taken_s: float, at_least_s: float) -> float:
-        """Return what is left of the time, once the parts of a fixed length are taken away."""
-        if length_s < taken_s + at_least_s - 1e-9:
-            shortest_s = math.ceil(10 * (taken_s + at_least_s)) / 10
-            raise ConfigError(
-                f"duration_s is {length_s:g}, too short for {self.name!r} at this speed: "
-                f"at least {shortest_s:g} s"
-            )
-        return length_s - taken_s
+STAND = Leg(AT_REST, STAND_S)
 
 
 def _ramp_s(change: Any, accel_mps2: float = ACCEL_MPS2, smooth: bool = False) -> float:
@@ -170,141 +139,25 @@ def _twists(legs: Sequence[Leg], time_s: Array, smooth: bool = False) -> Array:
     return np.asarray(twists[before] + part[:, None] * (twists[before + 1] - twists[before]))
 
 
-def _times(length_s: float) -> Array:
-    return np.arange(round(length_s * RATE_HZ) + 1) / RATE_HZ
+# What each scenario is made for by default; None where that follows from speed or terrains.
+DURATION_S: dict[str, float | None] = {
+    "stand": 20.0,
+    "straight": 20.0,
+    "arc": 20.0,
+    "starts": 30.0,
+    "spot_turn": 30.0,
+    "complex": 60.0,
+    "survey": 40.0,
+    "climb": 15.0,
+    "brake": None,
+    "circle": None,
+    "crab": 45.0,
+    "course": None,
+}
+SCENARIOS: tuple[str, ...] = tuple(DURATION_S)  # names that :func:`make_scenario` accepts
 
-
-def _survey(request: DriveRequest, length_s: float) -> list[Leg]:
-    """Draw legs, and brake in time to be at rest at the end."""
-    fastest = request.limit((1.2 * request.speed_mps, 0.0, 0.0))
-    brake_s = max(_ramp_s(fastest), SPOT_RADPS / YAW_ACCEL_RADPS2)
-    driven_s = request.remaining_s(length_s, brake_s + STAND_S, at_least_s=6.0)
-    legs, over_s = _take(_survey_legs(request), driven_s)
-    hold_s = legs[-1].hold_s - over_s
-    if hold_s < 0:  # braking starts in the middle of a ramp, from the twist that was reached there
-        legs[-1] = legs[-1]._replace(twist=_twists(legs, np.array([driven_s]))[0])
-    legs[-1] = legs[-1]._replace(hold_s=max(0.0, hold_s))
-    return [*legs, Leg(AT_REST, length_s)]
-
-
-def _survey_legs(request: DriveRequest) -> Iterator[Leg]:
-    rng = request.rng
-    yield _STAND
-    yield _stretch(request, 1.0, gentle_1pm=0.2)
-    while True:
-        kind = rng.choice(["stretch", "stop", "backward", "spot"], p=[0.7, 0.1, 0.1, 0.1])
-        if kind == "stretch":
-            yield _stretch(request, 1.0, gentle_1pm=0.2)
-            continue
-        yield Leg(AT_REST, rng.uniform(1.0, 2.0), rng.uniform(0.5, 1.0))
-        if kind == "backward":
-            yield _stretch(request, -1.0, gentle_1pm=0.2)
-            yield Leg(AT_REST, rng.uniform(1.0, 2.0), rng.uniform(0.5, 1.0))
-        elif kind == "spot":
-            yaw_radps = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, SPOT_RADPS)
-            yield Leg(request.limit((0.0, 0.0, yaw_radps)), rng.uniform(3.0, 5.0))
-            yield _STAND
-
-
-def _stretch(request: DriveRequest, direction: float, gentle_1pm: float) -> Leg:
-    """Draw a stretch of steady speed, every other one an arc of at most this curvature."""
-    rng = request.rng
-    speed_mps = direction * rng.uniform(0.4, 1.2) * request.speed_mps
-    curvature_1pm = rng.integers(2) * rng.uniform(-gentle_1pm, gentle_1pm)
-    twist = request.limit((speed_mps, 0.0, curvature_1pm * speed_mps))
-    return Leg(twist, rng.uniform(4.0, 6.0), rng.uniform(0.5, 1.0))
-
-
-def _course(
-    request: DriveRequest, desired_s: float | None, terrains: tuple[str, ...]
-) -> tuple[Array, Array, tuple[Patch, ...]]:
-    """Lay patches and drive over them; a given duration lays as many as are reached in it."""
-    patch_rng, motion_rng = request.rng.spawn(2)
-    request = request._replace(rng=motion_rng)
-    rounds = _rounds(terrains, patch_rng)
-    laid, end_m = next(rounds)
-    if desired_s is None:
-        slowest_mps = request.limit((0.4 * request.speed_mps, 0.0, 0.4 * request.speed_mps * 0.15))[0]
-        length_s = 2 * STAND_S + 2 * request.speed_mps / ACCEL_MPS2 + SLIP_MARGIN * end_m / slowest_mps
-    else:
-        length_s = desired_s
-        request.remaining_s(length_s, STAND_S + 1.2 * request.speed_mps / 0.5, at_least_s=3.0)
-
-    def legs() -> Iterator[Leg]:
-        yield _STAND
-        while True:
-            yield _stretch(request, 1.0, gentle_1pm=0.15)
-
-    time_s = _times(length_s)
-    twist = _twists(_take(legs(), length_s)[0], time_s)
-    reached_m = _distance_m(time_s, twist) / SLIP_MARGIN
-    if desired_s is None:
-        n = int(np.searchsorted(reached_m, end_m)) + 1
-        return time_s[:n], twist[:n], tuple(laid)
-    while end_m < reached_m[-1]:
-        patches, end_m = next(rounds)
-        laid += patches
-    return time_s, twist, tuple(patch for patch in laid if patch.start_m < reached_m[-1])
-
-
-def _rounds(terrains: tuple[str, ...], rng: np.random.Generator) -> Iterator[tuple[list[Patch], float]]:
-    """Yield round after round of patches, every terrain once in each, and where the round ends."""
-    start_m, last = 0.0, ""
-    while True:
-        names = [terrains[i] for i in rng.permutation(len(terrains))]
-        if names[0] == last:
-            names.append(names.pop(0))  # a change of terrain at every boundary, where there are two
-        patches = []
-        for terrain in names:
-            patches.append(Patch(start_m, terrain))
-            start_m += rng.uniform(*PATCH_M)
-        last = names[-1]
-        yield patches, start_m
-
-
-def _straight(request: DriveRequest, length_s: float) -> list[Leg]:
-    taken_s = STAND_S + request.speed_mps / request.accel_mps2
-    hold_s = request.remaining_s(length_s, taken_s, at_least_s=1.0)
-    return [_STAND, Leg(request.ahead, hold_s, request.accel_mps2)]
-
-
-def _brake(request: DriveRequest, length_s: float) -> list[Leg]:
-    taken_s = STAND_S + request.speed_mps / ACCEL_MPS2 + BRAKE_S
-    hold_s = request.remaining_s(length_s, taken_s, at_least_s=1.0)
-    return [_STAND, Leg(request.ahead, hold_s), Leg(AT_REST, BRAKE_S, math.inf)]
-
-
-def _circle(request: DriveRequest, length_s: float) -> list[Leg]:
-    return _held(request, length_s, request.around, at_least_s=2 * math.pi / float(request.around[2]))
-
-
-def _arc(request: DriveRequest, length_s: float) -> list[Leg]:
-    return _held(request, length_s, request.limit((request.speed_mps, 0.0, YAW_RATE_RADPS)), at_least_s=1.0)
-
-
-def _held(request: DriveRequest, length_s: float, twist: Array, at_least_s: float) -> list[Leg]:
-    """Return a twist from rest and to rest."""
-    hold_s = request.remaining_s(length_s, 2 * STAND_S + 2 * _ramp_s(twist), at_least_s)
-    return [_STAND, Leg(twist, hold_s), _STAND]
-
-
-def _starts(request: DriveRequest, length_s: float) -> list[Leg]:
-    drive_s = 3.0 + 2 * request.speed_mps / request.accel_mps2
-    n = max(1, int((length_s - STAND_S) / (drive_s + STAND_S)))
-    stand_s = request.remaining_s(length_s, n * drive_s, at_least_s=(n + 1) * STAND_S) / (n + 1)
-    once = [Leg(request.ahead, 3.0, request.accel_mps2), Leg(AT_REST, stand_s, request.accel_mps2)]
-    return [Leg(AT_REST, stand_s), *once * n]
-
-
-def _spot_turn(request: DriveRequest, length_s: float) -> list[Leg]:
-    left = request.limit((0.0, 0.0, SPOT_RADPS))
-    around_s = 2 * _ramp_s(left) + STAND_S
-    n = 2 * max(1, int((length_s - STAND_S) / (2 * (around_s + 2.0))))
-    hold_s = request.remaining_s(length_s, STAND_S + n * around_s, at_least_s=n * 1.0) / n
-    return [_STAND, *[Leg(left, hold_s), _STAND, Leg(-left, hold_s), _STAND] * (n // 2)]
-
-
-# speed_x and speed_y in cruising speeds, yaw rate in YAW_RATE_RADPS, share of the time that is held
+# Legs: speed_x and speed_y in cruising speeds, yaw rate in YAW_RATE_RADPS, share of the time that is held.  The ramps
+# of these start and end without a step of the acceleration.
 _CURVES = "1 0 0 4, .8 0 1 4, .8 0 -1 4, 0 0 0 1, -.8 0 0 3, -.6 0 1 4, -.6 0 -1 4, 0 0 0 1.5"
 _SIDEWAYS = "0 .5 0 3, 0 0 0 1, 0 -.5 0 3, 0 0 0 1.5, .5 .5 0 3, 0 0 0 1.5, .5 -.5 0 3"
 _ON_THE_SPOT = "0 0 2 4, 0 0 0 1, 0 0 -2 4"
@@ -313,45 +166,6 @@ _CRAB = (
     "-.6 0 0 3, .6 0 0 3, 0 0 0 1, 0 .5 0 3, 0 -.5 0 3, 0 0 0 1, .4 .4 0 3, -.4 -.4 0 3, 0 0 0 1, -.4 .4 0 3, "
     ".4 -.4 0 3"
 )
-
-
-def _complex(request: DriveRequest, length_s: float) -> list[Leg]:
-    return _tour(f"{_CURVES}, {_SIDEWAYS if request.sideways else _ON_THE_SPOT}", request, length_s)
-
-
-def _tour(legs: str, request: DriveRequest, length_s: float) -> list[Leg]:
-    table = np.array([leg.split() for leg in legs.split(",")], dtype=float)
-    twists = request.limit(table[:, :3] * (request.speed_mps, request.speed_mps, YAW_RATE_RADPS))
-    ramps_s = sum(_ramp_s(b - a, smooth=True) for a, b in pairwise([AT_REST, *twists, AT_REST]))
-    shares = table[:, 3] / table[:, 3].sum()
-    held_s = request.remaining_s(length_s, 2 * STAND_S + ramps_s, at_least_s=10.0)
-    driven = [Leg(twist, share * held_s) for twist, share in zip(twists, shares, strict=True)]
-    return [_STAND, *driven, _STAND]
-
-
-def _circle_s(request: DriveRequest) -> float:
-    return math.ceil(2 * STAND_S + 2 * _ramp_s(request.around) + 2 * math.pi / float(request.around[2]))
-
-
-_DRIVES: dict[
-    str, tuple[Callable[[DriveRequest, float], list[Leg]], float | Callable[[DriveRequest], float]]
-] = {
-    "stand": (lambda request, length_s: [Leg(AT_REST, length_s)], 20.0),
-    "straight": (_straight, 20.0),
-    "arc": (_arc, 20.0),
-    "starts": (_starts, 30.0),
-    "spot_turn": (_spot_turn, 30.0),
-    "complex": (_complex, 60.0),
-    "survey": (_survey, 40.0),
-    "climb": (_straight, 15.0),
-    "brake": (_brake, lambda request: STAND_S + request.speed_mps / ACCEL_MPS2 + 2 * BRAKE_S),
-    "circle": (_circle, _circle_s),
-    "crab": (lambda request, length_s: _tour(_CRAB, request, length_s), 45.0),
-}
-"""Legs of the drives on one terrain, and for how long they are driven by default."""
-
-_SMOOTH = ("complex", "crab")  # their ramps start and end without a step of the acceleration
-SCENARIOS: tuple[str, ...] = (*_DRIVES, "course")  # names that :func:`make_scenario` accepts
 
 
 def make_scenario(
@@ -434,41 +248,149 @@ def make_scenario(
         if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
             raise ConfigError(f"seed is {seed!r}, a whole number from 0 up is required")
         seed = np.random.default_rng(seed)
-    request = DriveRequest(name, *_ability(robot, speed_mps), seed, float(accel_mps2), robot.sideways)
-    if name == "course":
-        time_s, twist, patches = _course(request, duration_s, grounds)
-    else:
-        legs, default_s = _DRIVES[name]
-        length_s = duration_s if duration_s else default_s(request) if callable(default_s) else default_s
-        time_s = _times(length_s)
-        twist = _twists(legs(request, length_s), time_s, name in _SMOOTH)
-        patches = (Patch(0.0, grounds[0]),)
-    return Scenario(name, RATE_HZ, time_s, twist, patches)
-
-
-def _ability(robot: Robot, speed_mps: float | None) -> tuple[float, Callable[[Any], Array]]:
-    """Return the speed, checked, and what shortens a twist to what the robot can."""
-    positions_m, radius_m, car = (
-        robot.wheel_positions_m,
-        robot.wheel_radius_m,
-        isinstance(robot, BicycleRobot),
-    )
     motors = robot.motors if isinstance(robot, SwerveRobot) else robot.completed.motors
-    speed_max_radps = motors.speed_max_radps
+    wheels, radius_m, fastest_radps = robot.wheel_positions_m, robot.wheel_radius_m, motors.speed_max_radps
     if isinstance(robot, BicycleRobot):
-        speed_max_radps = min(speed_max_radps, robot.speed_max_mps / radius_m)
+        fastest_radps = min(fastest_radps, robot.speed_max_mps / radius_m)
+    fastest_mps = radius_m * fastest_radps
     if speed_mps is None:
-        fastest_mps = radius_m * speed_max_radps
         slow = car or fastest_mps < CRUISING_MPS
         speed_mps = CRUISING_SHARE * fastest_mps if slow else CRUISING_MPS
-    if not _is_number(speed_mps) or not 0 < speed_mps <= radius_m * speed_max_radps:
+    if not _is_number(speed_mps) or not 0 < speed_mps <= fastest_mps:
         raise ConfigError(
-            f"speed_mps is {speed_mps!r}: robot {robot.name} drives above 0 and up to "
-            f"{radius_m * speed_max_radps:g} m/s"
+            f"speed_mps is {speed_mps!r}: robot {robot.name} drives above 0 and up to {fastest_mps:g} m/s"
         )
-    if car or math.isinf(speed_max_radps):  # wheels of a car turn as fast as it drives
-        return float(speed_mps), lambda twist: np.asarray(twist, dtype=np.float64)
-    return float(speed_mps), lambda twist: scaled(positions_m, radius_m, twist, speed_max_radps)
+    rng, speed, accel = seed, float(speed_mps), float(accel_mps2)
+
+    def limit(twist: Any) -> Array:
+        """Shorten a twist to what the robot can; wheels of a car turn as fast as it drives."""
+        if car or math.isinf(fastest_radps):
+            return np.asarray(twist, dtype=np.float64)
+        return scaled(wheels, radius_m, twist, fastest_radps)
+
+    circle_mps = min(speed, CIRCLE_MPS)
+    ahead, around = limit((speed, 0.0, 0.0)), limit((circle_mps, 0.0, circle_mps / CIRCLE_M))
+    round_s = 2 * math.pi / float(around[2])
+    default_s = DURATION_S[name]
+    if name == "brake":
+        default_s = STAND_S + speed / ACCEL_MPS2 + 2 * BRAKE_S
+    elif name == "circle":
+        default_s = math.ceil(2 * STAND_S + 2 * _ramp_s(around) + round_s)
+    length_s = duration_s or default_s or 0.0
+
+    def remaining_s(taken_s: float, at_least_s: float) -> float:
+        """Return what is left of the time, once the parts of a fixed length are taken away."""
+        if length_s < taken_s + at_least_s - 1e-9:
+            raise ConfigError(
+                f"duration_s is {length_s:g}, too short for {name!r} at this speed: "
+                f"at least {math.ceil(10 * (taken_s + at_least_s)) / 10:g} s"
+            )
+        return length_s - taken_s
+
+    def stretch(direction: float, gentle_1pm: float) -> Leg:
+        """Draw a stretch of steady speed, every other one an arc of at most this curvature."""
+        drawn_mps = direction * rng.uniform(0.4, 1.2) * speed
+        curvature_1pm = rng.integers(2) * rng.uniform(-gentle_1pm, gentle_1pm)
+        twist = limit((drawn_mps, 0.0, curvature_1pm * drawn_mps))
+        return Leg(twist, rng.uniform(4.0, 6.0), rng.uniform(0.5, 1.0))
+
+    def survey() -> Iterator[Leg]:
+        yield STAND
+        yield stretch(1.0, 0.2)
+        while True:
+            kind = rng.choice(["stretch", "stop", "backward", "spot"], p=[0.7, 0.1, 0.1, 0.1])
+            if kind == "stretch":
+                yield stretch(1.0, 0.2)
+                continue
+            yield Leg(AT_REST, rng.uniform(1.0, 2.0), rng.uniform(0.5, 1.0))
+            if kind == "backward":
+                yield stretch(-1.0, 0.2)
+                yield Leg(AT_REST, rng.uniform(1.0, 2.0), rng.uniform(0.5, 1.0))
+            elif kind == "spot":
+                yaw_radps = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, SPOT_RADPS)
+                yield Leg(limit((0.0, 0.0, yaw_radps)), rng.uniform(3.0, 5.0))
+                yield STAND
+
+    def over_patches() -> Iterator[Leg]:
+        yield STAND
+        while True:
+            yield stretch(1.0, 0.15)
+
+    if name == "course":  # a given duration lays as many patches as are reached in it
+        patch_rng, rng = seed.spawn(2)
+        rounds = _rounds(grounds, patch_rng)
+        laid, end_m = next(rounds)
+        if duration_s is None:
+            slowest_mps = limit((0.4 * speed, 0.0, 0.4 * speed * 0.15))[0]
+            length_s = 2 * STAND_S + 2 * speed / ACCEL_MPS2 + SLIP_MARGIN * end_m / slowest_mps
+        else:
+            remaining_s(STAND_S + 1.2 * speed / 0.5, at_least_s=3.0)
+        time_s = np.arange(round(length_s * RATE_HZ) + 1) / RATE_HZ
+        twist = _twists(_take(over_patches(), length_s)[0], time_s)
+        reached_m = _distance_m(time_s, twist) / SLIP_MARGIN
+        if duration_s is None:
+            n = int(np.searchsorted(reached_m, end_m)) + 1
+            return Scenario(name, RATE_HZ, time_s[:n], twist[:n], tuple(laid))
+        while end_m < reached_m[-1]:
+            patches, end_m = next(rounds)
+            laid += patches
+        reached = tuple(patch for patch in laid if patch.start_m < reached_m[-1])
+        return Scenario(name, RATE_HZ, time_s, twist, reached)
+
+    legs = [Leg(AT_REST, length_s)]
+    if name in ("straight", "climb"):
+        legs = [STAND, Leg(ahead, remaining_s(STAND_S + speed / accel, 1.0), accel)]
+    elif name == "brake":
+        hold_s = remaining_s(STAND_S + speed / ACCEL_MPS2 + BRAKE_S, 1.0)
+        legs = [STAND, Leg(ahead, hold_s), Leg(AT_REST, BRAKE_S, math.inf)]
+    elif name in ("circle", "arc"):
+        arc = around if name == "circle" else limit((speed, 0.0, YAW_RATE_RADPS))
+        hold_s = remaining_s(2 * STAND_S + 2 * _ramp_s(arc), round_s if name == "circle" else 1.0)
+        legs = [STAND, Leg(arc, hold_s), STAND]
+    elif name == "starts":
+        drive_s = 3.0 + 2 * speed / accel
+        n = max(1, int((length_s - STAND_S) / (drive_s + STAND_S)))
+        stand_s = remaining_s(n * drive_s, (n + 1) * STAND_S) / (n + 1)
+        legs = [Leg(AT_REST, stand_s), *[Leg(ahead, 3.0, accel), Leg(AT_REST, stand_s, accel)] * n]
+    elif name == "spot_turn":
+        left = limit((0.0, 0.0, SPOT_RADPS))
+        around_s = 2 * _ramp_s(left) + STAND_S
+        n = 2 * max(1, int((length_s - STAND_S) / (2 * (around_s + 2.0))))
+        hold_s = remaining_s(STAND_S + n * around_s, n * 1.0) / n
+        legs = [STAND, *[Leg(left, hold_s), STAND, Leg(-left, hold_s), STAND] * (n // 2)]
+    elif name == "survey":  # legs are drawn; brakes in time to be at rest at the end
+        brake_s = max(_ramp_s(limit((1.2 * speed, 0.0, 0.0))), SPOT_RADPS / YAW_ACCEL_RADPS2)
+        driven_s = remaining_s(brake_s + STAND_S, 6.0)
+        legs, over_s = _take(survey(), driven_s)
+        hold_s = legs[-1].hold_s - over_s
+        if hold_s < 0:  # braking starts in the middle of a ramp, from the twist that was reached there
+            legs[-1] = legs[-1]._replace(twist=_twists(legs, np.array([driven_s]))[0])
+        legs = [*legs[:-1], legs[-1]._replace(hold_s=max(0.0, hold_s)), Leg(AT_REST, length_s)]
+    elif name in ("complex", "crab"):
+        rows = _CRAB if name == "crab" else f"{_CURVES}, {_SIDEWAYS if robot.sideways else _ON_THE_SPOT}"
+        table = np.array([row.split() for row in rows.split(",")], dtype=float)
+        twists = limit(table[:, :3] * (speed, speed, YAW_RATE_RADPS))
+        ramps_s = sum(_ramp_s(b - a, smooth=True) for a, b in pairwise([AT_REST, *twists, AT_REST]))
+        shares, held_s = table[:, 3] / table[:, 3].sum(), remaining_s(2 * STAND_S + ramps_s, 10.0)
+        legs = [STAND, *(Leg(t, share * held_s) for t, share in zip(twists, shares, strict=True)), STAND]
+    time_s = np.arange(round(length_s * RATE_HZ) + 1) / RATE_HZ
+    twist = _twists(legs, time_s, name in ("complex", "crab"))
+    return Scenario(name, RATE_HZ, time_s, twist, (Patch(0.0, grounds[0]),))
+
+
+def _rounds(terrains: tuple[str, ...], rng: np.random.Generator) -> Iterator[tuple[list[Patch], float]]:
+    """Yield round after round of patches, every terrain once in each, and where the round ends."""
+    start_m, last = 0.0, ""
+    while True:
+        names = [terrains[i] for i in rng.permutation(len(terrains))]
+        if names[0] == last:
+            names.append(names.pop(0))  # a change of terrain at every boundary, where there are two
+        patches = []
+        for terrain in names:
+            patches.append(Patch(start_m, terrain))
+            start_m += rng.uniform(*PATCH_M)
+        last = names[-1]
+        yield patches, start_m
 
 
 def _is_number(value: Any) -> bool:
@@ -529,60 +451,46 @@ class Conditions:
                     raise ConfigError(f"conditions: {name} is {value!r}, {desired} is required")
 
 
-@dataclass(frozen=True, slots=True)
-class Spread:
-    """How wide :class:`Conditions` scatter (``data/spread/field.yaml`` has the sources)."""
-
-    payload_max_kg: float
-    payload_offset_m: float
-    grade_std_ratio: float
-    undulation_std_ratio: float
-    undulation_length_m: float
-    radius_std_ratio: float
-    roughness_log_std_ratio: float
-    field_length_m: float
-
-
-def load_spread() -> Spread:
-    """Return the spread that travels with the package.
+@cache
+def field_spread() -> dict[str, float]:
+    """Return how wide :class:`Conditions` scatter: ``data/spread/field.yaml``, which has the sources.
 
     Examples
     --------
-    >>> load_spread().grade_std_ratio
+    >>> field_spread()["grade_std_ratio"]
     0.035
     """
     described = read_yaml(data_folder("spread") / "field.yaml")
-    return Spread(**{item.name: float(described[item.name]["value"]) for item in fields(Spread)})
+    return {name: float(entry["value"]) for name, entry in described.items() if name != "name"}
 
 
-def draw_conditions(
-    spread: Spread, rng: np.random.Generator, nominal: Conditions | None = None
-) -> Conditions:
+def draw_conditions(rng: np.random.Generator, nominal: Conditions | None = None) -> Conditions:
     """Return the conditions of one run, drawn around the nominal ones.
 
     Normal draws are cut at two standard deviations, so that no run is impossible.  Lengths are the spread's.
     """
-    nominal = Conditions() if nominal is None else nominal
+    nominal, spread = nominal or Conditions(), field_spread()
 
-    def normal(std: float, n: int) -> Array:
-        return std * np.clip(rng.standard_normal(n), -2.0, 2.0)
+    def normal(name: str, n: int) -> Array:
+        return spread[name] * np.clip(rng.standard_normal(n), -2.0, 2.0)
 
-    grade = np.array(nominal.grade_ratio) + normal(spread.grade_std_ratio, 2)
-    radius = np.array(nominal.radius_factors) * (1.0 + normal(spread.radius_std_ratio, 3))
-    offset = np.array(nominal.payload_m) + rng.uniform(-spread.payload_offset_m, spread.payload_offset_m, 2)
-    payload_kg = nominal.payload_kg + float(rng.uniform(0.0, spread.payload_max_kg))
-    undulation = nominal.undulation_ratio + float(normal(spread.undulation_std_ratio, 1)[0])
-    rougher = float(np.exp(normal(spread.roughness_log_std_ratio, 1)[0]))
-    return Conditions(
+    grade = np.array(nominal.grade_ratio) + normal("grade_std_ratio", 2)
+    radius = np.array(nominal.radius_factors) * (1.0 + normal("radius_std_ratio", 3))
+    offset_m = spread["payload_offset_m"]
+    offset = np.array(nominal.payload_m) + rng.uniform(-offset_m, offset_m, 2)
+    payload_kg = nominal.payload_kg + float(rng.uniform(0.0, spread["payload_max_kg"]))
+    undulation = nominal.undulation_ratio + float(normal("undulation_std_ratio", 1)[0])
+    rougher = float(np.exp(normal("roughness_log_std_ratio", 1)[0]))
+    return replace(
+        nominal,
         payload_kg=payload_kg,
-        payload_m=(float(offset[0]), float(offset[1])),
-        grade_ratio=(float(grade[0]), float(grade[1])),
+        payload_m=tuple(offset.tolist()),
+        grade_ratio=tuple(grade.tolist()),
         undulation_ratio=undulation,
-        undulation_length_m=spread.undulation_length_m,
-        radius_factors=(float(radius[0]), float(radius[1]), float(radius[2])),
+        undulation_length_m=spread["undulation_length_m"],
+        radius_factors=tuple(radius.tolist()),
         roughness_factor=nominal.roughness_factor * rougher,
-        field_length_m=spread.field_length_m,
-        leg_backlash_rad=nominal.leg_backlash_rad,
+        field_length_m=spread["field_length_m"],
     )
 
 

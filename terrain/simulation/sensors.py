@@ -8,16 +8,14 @@ is made; after that it follows the motion in blocks of any length: a run in one 
 same bytes.
 
 A sample of an IMU is ``scale x + bias + noise`` of each quantity ``x`` (:func:`imu_values`).  The plants differ in the
-errors that they draw (:class:`ImuErrors`): the dynamic plant draws biases anew for each power-on and lets those of the
-gyro walk (:func:`draw_imu_errors`), the planar one adds coloured vibration while the robot moves
-(:mod:`terrain.simulation.plants.planar`), and those of tracks and of the car white noise (:func:`white_imu`).
+errors that they draw: the dynamic plant draws biases anew for each power-on and lets those of the gyro walk
+(:func:`draw_imu_errors`), the planar one adds coloured vibration while the robot moves, tracks and car white noise.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -121,7 +119,8 @@ class Sensor:
     channels : of its stream
     stamps : (n,) when its samples arrive, and (n,) rows of the motion that they measure, none later than the sample
     write : from samples (k), their rows (k,) and low-passed signals there to their values (k, channels)
-    signals : writes signals (m, c) of the motion's rows from a first one on, and their low-pass; none by default
+    signals : writes signals (m, c) of the motion's rows from a first one on; none by default
+    lags_s : (c,) time constants of their low-passes, which start at rest at the first values
     ahead : rows beyond its own that a signal needs
     """
 
@@ -131,33 +130,39 @@ class Sensor:
         channels: tuple[str, ...],
         stamps: tuple[Array, Array],
         write: Callable[[slice, Array, Array], Array],
-        signals: tuple[Callable[[int, Array], None], LowPass] | None = None,
+        signals: Callable[[int, Array], None] | None = None,
+        lags_s: Sequence[float] = (),
         ahead: int = 0,
     ) -> None:
         self.motion, self.channels, (self.time_s, self.rows) = motion, channels, stamps
         self.values = np.empty((len(self.time_s), len(channels)))
         self._write, self._signals, self._ahead = write, signals, ahead
+        self._keep = np.array([math.exp(-STEP_S / tau) if tau > 0.0 else 0.0 for tau in lags_s])
+        self._start, self._state = np.empty(0), np.zeros(len(self._keep))
         self._first, self._seen = 0, np.empty((0, 0))
-        self._logged = (self.time_s.view(), self.values.view())
-        for array in self._logged:
-            array.flags.writeable = False
         self._n_written = self._n_given = 0
+        self.stamp("", {})
 
     def stamp(self, stream: str, effects: Mapping[str, float]) -> None:
         """Stamp as effects have it; samples arrive when they did."""
-        self._logged = (on_samples(stream, (), effects)(self.time_s.copy(), self.values)[0], self._logged[1])
-        self._logged[0].flags.writeable = False
+        time_s = (
+            on_samples(stream, (), effects)(self.time_s.copy(), self.values)[0] if stream else self.time_s
+        )
+        self._logged = (time_s.view(), self.values.view())
+        for array in self._logged:
+            array.flags.writeable = False
 
     def update(self) -> None:
         """Write the samples of all rows of the motion that are written."""
         n_rows = self.motion.n_rows
         end = max(n_rows - self._ahead, min(n_rows, 1))
         if self._signals is not None:
-            fill, low_pass = self._signals
             self._first += len(self._seen)
-            self._seen = np.empty((end - self._first, low_pass.n))
-            fill(self._first, self._seen)
-            low_pass(self._seen)
+            self._seen = np.empty((end - self._first, len(self._keep)))
+            self._signals(self._first, self._seen)
+            if len(self._seen):
+                self._start = self._start if self._start.size else self._seen[0].copy()
+                _low_pass(self._seen, self._keep, self._start, self._state)
         new = slice(self._n_written, int(self.rows.searchsorted(end)))
         if new.start < new.stop:
             rows = self.rows[new]
@@ -174,25 +179,6 @@ class Sensor:
     def stream(self) -> Stream:
         """Return all samples, once the motion is complete."""
         return Stream(*self._logged, self.channels)
-
-
-class LowPass:
-    """First-order low-passes of several quantities, started at rest at the first values.
-
-    Called with values (n, c) at :data:`STEP_S`, they filter them in place and keep their state.
-    """
-
-    def __init__(self, time_constants_s: Sequence[float]) -> None:
-        self.n = len(time_constants_s)
-        self._keep = np.array([math.exp(-STEP_S / tau) if tau > 0.0 else 0.0 for tau in time_constants_s])
-        self._start: Array | None = None
-        self._state = np.zeros(self.n)
-
-    def __call__(self, values: Array) -> None:
-        """Filter values (n, c) in place."""
-        if len(values):
-            self._start = values[0].copy() if self._start is None else self._start
-            _low_pass(values, self._keep, self._start, self._state)
 
 
 @njit
@@ -280,86 +266,50 @@ def steering_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> S
     return Sensor(motion, STEERING_CHANNELS, stamps, write)
 
 
-IMU_BANDWIDTH_HZ = {
-    "accel": 62.5,
-    "gyro": 47.0,
-}  # bandwidths of the BNO055 in its fusion modes (Bosch data sheet)
-TILT_NOISE_RAD = 0.001  # sample noise of the fused roll and pitch; assumed
+# Bandwidths of the BNO055 in its fusion modes (Bosch data sheet), and noise of its fused roll and pitch; assumed.
+IMU_BANDWIDTH_HZ, TILT_NOISE_RAD = {"accel": 62.5, "gyro": 47.0}, 0.001
 
 
-def described_calibration(sensors: Sensors) -> tuple[Array, Array, Array]:
-    """Return a description's scales (3,) of the accelerometer, and biases (3,) of accelerometer and gyro, by axis."""
-    patterns = ("accel_scale_{}_ratio", "accel_bias_{}_mps2", "gyro_bias_{}_radps")
-    scale, accel, gyro = (
-        np.array([getattr(sensors, pattern.format(axis)) for axis in "xyz"]) for pattern in patterns
-    )
-    return scale, accel, gyro
-
-
-class ImuErrors(NamedTuple):
-    """What an IMU adds to n samples."""
-
-    accel_scale_ratio: Array  # (3,) factor on the specific force
-    yaw_scale_ratio: float  # factor on yaw rate and fused yaw
-    rate_bias_radps: Array  # (n, 3) of the gyro
-    rate_noise_radps: Array
-    accel_bias_mps2: Array  # (3,) and (n, 3) of the accelerometer
-    accel_noise_mps2: Array
-    tilt_bias_rad: Array  # (2,) and (n, 2) of the fused roll and pitch
-    tilt_noise_rad: Array
-    yaw_bias_rad: Array  # (n,) of the fused yaw, which sums the errors of the yaw rate
-    yaw_noise_rad: Array
+def described_imu(sensors: Sensors) -> tuple[Array, Array]:
+    """Return a description's factors (9,) and biases (9,) of the channels of an IMU."""
+    scale, bias = np.ones(9), np.zeros(9)
+    for i, axis in enumerate("xyz"):
+        scale[3 + i] = getattr(sensors, f"accel_scale_{axis}_ratio")
+        bias[i] = getattr(sensors, f"gyro_bias_{axis}_radps")
+        bias[3 + i] = getattr(sensors, f"accel_bias_{axis}_mps2")
+    return scale, bias
 
 
 def draw_imu_errors(
     sensors: Sensors, n: int, rng: np.random.Generator, gyro_scale_ratio: float = 0.0
-) -> ImuErrors:
-    """Return the errors of n samples of one power-on: biases about those described, the gyro's as random walks."""
-    scale, accel_bias, gyro_bias = described_calibration(sensors)
-    accel_bias = accel_bias + sensors.accel_bias_std_mps2 * rng.standard_normal(3)
-    gyro_bias = gyro_bias + sensors.gyro_bias_std_radps * rng.standard_normal(3)
-    period_s = 1 / sensors.imu_rate_hz
-    walk = sensors.gyro_walk_radps * math.sqrt(period_s) * rng.standard_normal((n, 3)).cumsum(axis=0)
-    bias = gyro_bias + walk
-    accel_noise = sensors.accel_std_mps2 * rng.standard_normal((n, 3))
-    gyro_noise = sensors.gyro_std_radps * rng.standard_normal((n, 3))
-    mounting = sensors.tilt_std_rad * rng.standard_normal(2)
-    tilt_noise = TILT_NOISE_RAD * rng.standard_normal((n, 2))
-    return ImuErrors(
-        accel_scale_ratio=scale,
-        yaw_scale_ratio=1.0 + gyro_scale_ratio,
-        rate_bias_radps=bias,
-        rate_noise_radps=gyro_noise,
-        accel_bias_mps2=accel_bias,
-        accel_noise_mps2=accel_noise,
-        tilt_bias_rad=mounting,
-        tilt_noise_rad=tilt_noise,
-        yaw_bias_rad=np.concatenate([[0.0], np.cumsum(bias[1:, 2]) * period_s]),
-        yaw_noise_rad=sensors.yaw_std_rad * rng.standard_normal(n),
-    )
+) -> tuple[Array, Array, Array]:
+    """Return factors (9,), biases (n, 9) and noise (n, 9) of one power-on: about those described, the gyro's walk."""
+    scale, described = described_imu(sensors)
+    scale[[2, 8]] += gyro_scale_ratio
+    bias, noise, period_s = np.tile(described, (n, 1)), np.empty((n, 9)), 1 / sensors.imu_rate_hz
+    bias[:, 3:6] += sensors.accel_bias_std_mps2 * rng.standard_normal(3)
+    bias[:, :3] += sensors.gyro_bias_std_radps * rng.standard_normal(3)
+    bias[:, :3] += sensors.gyro_walk_radps * math.sqrt(period_s) * rng.standard_normal((n, 3)).cumsum(axis=0)
+    noise[:, 3:6] = sensors.accel_std_mps2 * rng.standard_normal((n, 3))
+    noise[:, :3] = sensors.gyro_std_radps * rng.standard_normal((n, 3))
+    bias[:, 6:8] = sensors.tilt_std_rad * rng.standard_normal(2)
+    noise[:, 6:8] = TILT_NOISE_RAD * rng.standard_normal((n, 2))
+    bias[1:, 8] = np.cumsum(bias[1:, 2]) * period_s  # the fused yaw sums the errors of the yaw rate
+    noise[:, 8] = sensors.yaw_std_rad * rng.standard_normal(n)
+    return scale, bias, noise
 
 
-def imu_values(
-    errors: ImuErrors, which: slice, force_mps2: Array, rate_radps: Array, tilt_rad: Array, yaw_rad: Array
-) -> Array:
-    """Return the values (k, 9) of the samples ``which``, in the order of ``IMU_CHANNELS``.
+def imu_values(true: Array, scale: Array | float, bias: Array | float, noise: Array) -> Array:
+    """Return the values (k, 9) of samples, in the order of ``IMU_CHANNELS``.
 
     Parameters
     ----------
-    errors : of all n samples
-    force_mps2, rate_radps : (k, 3) specific force and body rates, behind the sensor's own low-pass
-    tilt_rad : (k, 2) roll and pitch
-    yaw_rad : (k,) from the start of the run
+    true : (k, 9) body rates, specific force, roll, pitch and the yaw from the start of the run, behind the low-pass
+    scale, bias, noise : of each quantity
     """
-    values = np.empty((len(yaw_rad), 9))
-    values[:, :3] = rate_radps * [1.0, 1.0, errors.yaw_scale_ratio] + errors.rate_bias_radps[which]
-    values[:, :3] += errors.rate_noise_radps[which]
-    values[:, 3:6] = errors.accel_scale_ratio * force_mps2 + errors.accel_bias_mps2
-    values[:, 3:6] += errors.accel_noise_mps2[which]
-    values[:, 6:8] = tilt_rad + errors.tilt_bias_rad + errors.tilt_noise_rad[which]
-    yaw = errors.yaw_scale_ratio * yaw_rad + errors.yaw_bias_rad[which] + errors.yaw_noise_rad[which]
-    values[:, 8] = wrapped(yaw)
-    return values
+    values = true * scale + bias + noise
+    values[:, 8] = wrapped(values[:, 8])
+    return np.asarray(values)
 
 
 def imu_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> tuple[Sensor, Array]:
@@ -373,66 +323,57 @@ def imu_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> tuple[
     """
     sensors, height_m, record = robot.equipment.sensors, robot.equipment.body.com_height_m, motion.record
     stamps = motion.at(sensors.imu_rate_hz, max(sensors.imu_latency_s, STEP_S))
-    errors = draw_imu_errors(sensors, len(stamps[0]), rng, robot.effects.get("gyro_scale_ratio", 0.0))
-    cutoffs_hz = [IMU_BANDWIDTH_HZ[name] for name in ("accel", "accel", "accel", "gyro", "gyro", "gyro")]
-    low_pass = LowPass([1 / (2 * math.pi * cutoff_hz) for cutoff_hz in cutoffs_hz])
+    scale, bias, noise = draw_imu_errors(
+        sensors, len(stamps[0]), rng, robot.effects.get("gyro_scale_ratio", 0.0)
+    )
+    lags_s = [1 / (2 * math.pi * IMU_BANDWIDTH_HZ[name]) for name in ("gyro", "accel") for _ in range(3)]
 
     def fill(first: int, out: Array) -> None:
-        _force_and_rates(record, motion.up, first, height_m, out)
+        _rates_and_force(record, motion.up, first, height_m, out)
 
     def write(new: slice, rows: Array, seen: Array) -> Array:
         at = record[rows]
-        tilt = np.column_stack([at["roll_rad"], at["pitch_rad"]])
-        return imu_values(errors, new, seen[:, :3], seen[:, 3:], tilt, at["yaw_rad"] - record["yaw_rad"][0])
+        true = np.column_stack([seen, at["roll_rad"], at["pitch_rad"], at["yaw_rad"] - record["yaw_rad"][0]])
+        return imu_values(true, scale, bias[new], noise[new])
 
-    sensor = Sensor(motion, IMU_CHANNELS, stamps, write, (fill, low_pass), ahead=1)
-    return sensor, errors.rate_bias_radps[:, 2]
+    return Sensor(motion, IMU_CHANNELS, stamps, write, fill, lags_s, ahead=1), bias[:, 2]
 
 
-def white_imu(
-    time_s: Array, rate_radps: Array, accel_mps2: Array, attitude_rad: Array, noise: Array
-) -> Stream:
-    """Return the samples of an IMU whose errors are white noise and what its rates and attitude already have.
+def tilted_imu(rate_radps: Array, accel_mps2: Array, attitude_rad: Array) -> Array:
+    """Return what an IMU without errors measures (n, 9).
 
     Parameters
     ----------
-    time_s : (n,)
     rate_radps : (n, 3) of the body
     accel_mps2 : (n, 2) of the IMU's place along the axes of the body, in the plane of the ground
     attitude_rad : (n, 3) roll, pitch and yaw
-    noise : (n, 9) in the order of ``IMU_CHANNELS``
     """
     roll, pitch, _ = attitude_rad.T
     force = np.column_stack([-np.sin(pitch), np.sin(roll), np.cos(roll)]) * GRAVITY_MPS2
     force[:, 1:] *= np.cos(pitch)[:, None]
     force[:, :2] += accel_mps2
-    values = np.hstack([rate_radps, force, attitude_rad]) + noise
-    values[:, 8] = wrapped(values[:, 8])
-    return Stream(time_s, values, IMU_CHANNELS)
+    return np.hstack([rate_radps, force, attitude_rad])
 
 
 @njit
-def _force_and_rates(record: Array, up: Array, first: int, height_m: float, out: Array) -> None:
-    """Write specific force and body rates (n, 6) of the rows from ``first`` on."""
+def _rates_and_force(record: Array, up: Array, first: int, height_m: float, out: Array) -> None:
+    """Write body rates and specific force (n, 6) of the rows from ``first`` on."""
     for i in range(out.shape[0]):
         k = first + i
         row = record[k]
         x, y, z = up[k, 0], up[k, 1], up[k, 2]
-        out[i, 0] = GRAVITY_MPS2 * x + (row.accel_x_mps2 + height_m * row.ride_pitch_radps2)
-        out[i, 1] = GRAVITY_MPS2 * y + (row.accel_y_mps2 - height_m * row.ride_roll_radps2)
-        out[i, 2] = GRAVITY_MPS2 * z + row.ride_z_mps2
-        out[i, 3], out[i, 4], out[i, 5] = 0.0, 0.0, row.yaw_rate_radps
+        out[i, 3] = GRAVITY_MPS2 * x + (row.accel_x_mps2 + height_m * row.ride_pitch_radps2)
+        out[i, 4] = GRAVITY_MPS2 * y + (row.accel_y_mps2 - height_m * row.ride_roll_radps2)
+        out[i, 5] = GRAVITY_MPS2 * z + row.ride_z_mps2
+        out[i, 0], out[i, 1], out[i, 2] = 0.0, 0.0, row.yaw_rate_radps
         if k > 0:  # up is constant in the world: d(up)/dt = up x rate
             change_x = (up[k + 1, 0] - up[k - 1, 0]) / (2.0 * STEP_S)
             change_y = (up[k + 1, 1] - up[k - 1, 1]) / (2.0 * STEP_S)
-            out[i, 3] = (change_y + row.yaw_rate_radps * x) / z
-            out[i, 4] = (row.yaw_rate_radps * y - change_x) / z
+            out[i, 0] = (change_y + row.yaw_rate_radps * x) / z
+            out[i, 1] = (row.yaw_rate_radps * y - change_x) / z
 
 
 JUMP_SAMPLES = 4  # number of samples with a wrong speed at a relocalisation of the camera; assumed
-# First columns of a camera's errors: of yaw, velocity and rate, both in the camera's axes; and their number.
-YAW_ERROR, VELOCITY_ERROR, RATE_ERROR, N_ERRORS = 0, 1, 4, 7
-
 _SEEN = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "roll_rad", "pitch_rad", "yaw_rad")
 
 
@@ -461,10 +402,10 @@ def camera_sensor(motion: Motion, robot: Robot, rng: np.random.Generator, faults
             shown = to_camera(np.append(jumps[i], 0.0)) * camera.rate_hz / JUMP_SAMPLES
             speed_noise[i : i + JUMP_SAMPLES] += shown
     rate_noise = camera.yaw_rate_std_radps * rng.standard_normal((n, 3))
-    drift, position_noise, jumped = drift[~lost], position_noise[~lost], jumped[~lost]
-    errors = np.column_stack([yaw_noise, speed_noise, rate_noise])[~lost]
+    place_error = (drift + position_noise + jumped)[~lost]
     lever_m = np.array([camera.lever_x_m, camera.lever_y_m, camera.lever_z_m])
     yaw_noise_0, changed = yaw_noise[0] if n else 0.0, on_samples("odometry", CAMERA_CHANNELS, robot.effects)
+    yaw_noise, speed_noise, rate_noise = yaw_noise[~lost], speed_noise[~lost], rate_noise[~lost]
 
     def fill(first: int, out: Array) -> None:
         for i, name in enumerate(_SEEN):
@@ -472,37 +413,36 @@ def camera_sensor(motion: Motion, robot: Robot, rng: np.random.Generator, faults
 
     def write(new: slice, rows: Array, seen: Array) -> Array:
         place = np.column_stack([record["position_x_m"][rows], record["position_y_m"][rows]])
-        position = place + drift[new] + position_noise[new] + jumped[new]
-        values = np.empty((len(rows), len(CAMERA_CHANNELS)))
-        yaw_0 = record["yaw_rad"][0] + yaw_noise_0
-        camera_samples(position, seen, errors[new], lever_m, yaw_0, values)
+        seen[:, 5] += yaw_noise[new]
+        values = camera_values(place + place_error[new], seen, lever_m, record["yaw_rad"][0] + yaw_noise_0)
+        values[:, 7:10] += speed_noise[new]
+        values[:, 10:13] += rate_noise[new]
         return changed(time_s[~lost][new], values)[1]
 
-    low_pass = LowPass([camera.time_constant_s] * len(_SEEN))
-    return Sensor(motion, CAMERA_CHANNELS, (time_s[~lost], rows[~lost]), write, (fill, low_pass))
+    stamps = time_s[~lost], rows[~lost]
+    return Sensor(motion, CAMERA_CHANNELS, stamps, write, fill, [camera.time_constant_s] * len(_SEEN))
 
 
 @njit
-def camera_samples(
-    position_m: Array, motion: Array, errors: Array, lever_m: Array, yaw_0: float, values: Array
-) -> None:
-    """Write the camera's samples: the quaternion of yaw, pitch and roll in turn, and the vectors it rotates.
+def camera_values(position_m: Array, motion: Array, lever_m: Array, yaw_0: float) -> Array:
+    """Return the camera's samples: the quaternion of yaw, pitch and roll in turn, and the vectors it rotates.
 
     Parameters
     ----------
     position_m : (n, 2) of the body's origin, with its error
     motion : (n, 6) speed x and y of the body's origin, yaw rate, roll, pitch and yaw
-    errors : (n, N_ERRORS) of yaw, velocity and rate
     lever_m : (3,) from the body's origin to the camera
     yaw_0 : heading at power-on
-    values : (n, 14) is written, in the order of :data:`terrain.kinematics.camera.CHANNELS` and in the axes of
-        :func:`terrain.kinematics.camera.to_camera`
+
+    Returns
+    -------
+    (n, 14) in the order of :data:`terrain.kinematics.camera.CHANNELS` and in the axes of
+    :func:`terrain.kinematics.camera.to_camera`
     """
+    values = np.zeros((motion.shape[0], 14))
     w_0, z_0 = math.cos(-yaw_0 / 2), math.sin(-yaw_0 / 2)
     for i in range(motion.shape[0]):
-        turn = motion[i, 2]
-        half_roll, half_pitch = motion[i, 3] / 2, motion[i, 4] / 2
-        half_yaw = (motion[i, 5] + errors[i, YAW_ERROR] - yaw_0) / 2
+        half_roll, half_pitch, half_yaw = motion[i, 3] / 2, motion[i, 4] / 2, (motion[i, 5] - yaw_0) / 2
         cr, sr = math.cos(half_roll), math.sin(half_roll)
         cp, sp = math.cos(half_pitch), math.sin(half_pitch)
         cy, sy = math.cos(half_yaw), math.sin(half_yaw)
@@ -512,19 +452,16 @@ def camera_samples(
         z = sy * cp * cr - cy * sp * sr
         place = _rotated(w_0, 0.0, 0.0, z_0, position_m[i, 0], position_m[i, 1], 0.0)
         lever = _rotated(w, x, y, z, lever_m[0], lever_m[1], lever_m[2])
-        ahead, left = point_velocity(motion[i, 0], motion[i, 1], turn, lever_m[0], lever_m[1])
+        ahead, left = point_velocity(motion[i, 0], motion[i, 1], motion[i, 2], lever_m[0], lever_m[1])
         velocity = _rotated(w, x, y, z, ahead, left, 0.0)
         row = values[i]
         row[0] = -(place[1] + lever[1] - lever_m[1])
         row[1] = lever[2] - lever_m[2]
         row[2] = -(place[0] + lever[0] - lever_m[0])
         row[3], row[4], row[5], row[6] = -y, z, -x, w
-        row[7] = errors[i, VELOCITY_ERROR] - velocity[1]
-        row[8] = errors[i, VELOCITY_ERROR + 1] + velocity[2]
-        row[9] = errors[i, VELOCITY_ERROR + 2] - velocity[0]
-        row[10], row[11] = errors[i, RATE_ERROR], errors[i, RATE_ERROR + 1] + turn
-        row[12] = errors[i, RATE_ERROR + 2]
-        row[13] = 1.0
+        row[7], row[8], row[9] = -velocity[1], velocity[2], -velocity[0]
+        row[11], row[13] = motion[i, 2], 1.0
+    return values
 
 
 @inner
@@ -539,8 +476,7 @@ def _rotated(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Gnss:
+class Gnss(NamedTuple):
     """An RTK receiver with its antenna above the body's origin.
 
     Fix to 2 cm and 10 Hz: thesis 5.1.1.  A float solution of half a metre, the latency of the radio link, the accuracy
@@ -559,38 +495,35 @@ class Gnss:
 def gnss_sensor(motion: Motion, receiver: Gnss, rng: np.random.Generator, faults: Faults) -> Sensor:
     """Return RTK positions and speeds in the world frame, with stretches of float."""
     time_s, rows = motion.at(receiver.rate_hz, receiver.latency_s)
-    n, record = len(rows), motion.record
-    fixed, state = np.empty(n, dtype=bool), True
-    leave = rng.random(n) * receiver.rate_hz
-    for i in range(n):
-        state = state != bool(leave[i] < 1 / (receiver.fix_length_s if state else receiver.float_length_s))
+    fixed, state = np.empty(len(rows), dtype=bool), True
+    for i, chance in enumerate(rng.random(len(rows)) * receiver.rate_hz):
+        state = state != bool(chance < 1 / (receiver.fix_length_s if state else receiver.float_length_s))
         fixed[i] = state
     std = np.where(fixed, receiver.fix_std_m, receiver.float_std_m)
-    position_noise = std[:, None] * rng.standard_normal((n, 2))
-    noise = np.column_stack([position_noise, receiver.speed_std_mps * rng.standard_normal((n, 2))])
+    noise = std[:, None] * rng.standard_normal((len(rows), 2))
+    noise = np.column_stack([noise, receiver.speed_std_mps * rng.standard_normal((len(rows), 2))])
     kept = ~is_lost(time_s, faults.gnss_lost_s)
-    noise, quality = noise[kept], np.column_stack([std, fixed])[kept]
+    noise, std, fixed = noise[kept], std[kept], fixed[kept]
 
     def write(new: slice, rows: Array, _: Array) -> Array:
-        at = record[rows]
-        place = np.column_stack([at["position_x_m"], at["position_y_m"]])
-        return np.hstack([np.hstack([place, over_ground(at)]) + noise[new], quality[new]])
+        return fixes(motion.record[rows], noise[new], std[new], fixed[new])
 
     return Sensor(motion, GNSS_CHANNELS, (time_s[kept], rows[kept]), write)
 
 
-def over_ground(rows: Array) -> Array:
-    """Return the velocity (n, 2) in the world of rows that have those of :data:`BODY`."""
+def fixes(rows: Array, noise: Array, std_m: Array | float, fixed: Array | float = 1.0) -> Array:
+    """Return the samples (n, 6) of a receiver from rows that have those of :data:`BODY`, with noise (n, 4)."""
     cos, sin = np.cos(rows["yaw_rad"]), np.sin(rows["yaw_rad"])
     ahead, left = rows["speed_x_mps"], rows["speed_y_mps"]
-    return np.column_stack([ahead * cos - left * sin, ahead * sin + left * cos])
+    velocity = ahead * cos - left * sin, ahead * sin + left * cos
+    values = np.column_stack([rows["position_x_m"], rows["position_y_m"], *velocity]) + noise
+    one = np.ones(len(rows))
+    return np.column_stack([values, std_m * one, fixed * one])
 
 
-# Rate and noise of raw fixes (Deremetz et al., ICRA 2017, section VI), and of a compass (half a degree, assumed).
-RAW_HZ, RAW_STD_M, COMPASS_STD_RAD = 10.0, 0.02, 0.0087
-SPEED_FACTOR_PS = (
-    1.5  # noise of a velocity over that of the position, as the Doppler speed of the other receiver
-)
+# Rate and noise of raw fixes (Deremetz et al., ICRA 2017, section VI), and of a compass (half a degree, assumed); noise
+# of a velocity over that of the position, as the Doppler speed of the other receiver.
+RAW_HZ, RAW_STD_M, COMPASS_STD_RAD, SPEED_FACTOR_PS = 10.0, 0.02, 0.0087, 1.5
 
 
 def raw_fixes(
@@ -601,29 +534,17 @@ def raw_fixes(
     std_rad: float = COMPASS_STD_RAD,
 ) -> dict[str, Stream]:
     """Return the streams ``gnss`` and ``compass`` of rows (n,) that have those of :data:`BODY`, at stamps (n,)."""
-    n, place = len(time_s), np.column_stack([rows["position_x_m"], rows["position_y_m"]])
-    fixes = np.column_stack(
-        [
-            place + std_m * rng.standard_normal((n, 2)),
-            over_ground(rows) + SPEED_FACTOR_PS * std_m * rng.standard_normal((n, 2)),
-            np.full(n, std_m),
-            np.ones(n),
-        ]
-    )
+    n = len(time_s)
+    noise = std_m * rng.standard_normal((n, 2)), SPEED_FACTOR_PS * std_m * rng.standard_normal((n, 2))
     heading = wrapped(rows["yaw_rad"] + std_rad * rng.standard_normal(n))
     return {
-        "gnss": Stream(time_s, fixes, GNSS_CHANNELS),
+        "gnss": Stream(time_s, fixes(rows, np.hstack(noise), std_m), GNSS_CHANNELS),
         "compass": Stream(time_s, heading[:, None], ("yaw_rad",)),
     }
 
 
 TRUTH_HZ = 100.0  # rate of the stream: a compromise with the size of files
 GYRO_BIAS = "gyro_bias_z_radps"  # channel of the true bias of the yaw gyro
-
-_WHEEL_TRUTH = (
-    *("wheel_radps", "steer_rad", "slip_ratio", "slip_angle_rad", "normal_n", "traction_n", "torque_nm"),
-    *("sinkage_m", "side_n"),
-)
 
 
 def wheel_channels(quantity: str, wheels: Sequence[str]) -> tuple[str, ...]:
@@ -638,18 +559,18 @@ def wheel_channels(quantity: str, wheels: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{name}_{wheel}_{unit}" for wheel in wheels)
 
 
-def truth_stream(time_s: Array, rows: Array, more: Mapping[str, Any]) -> Stream:
-    """Return the truth of rows (n,) that have those of :data:`BODY`, and more channels or others (n,) by name."""
-    columns = {name: rows[name] for name in BODY.names or ()} | dict(more)
+def truth_stream(
+    time_s: Array, rows: Array, wheels: Sequence[str], of_wheels: Mapping[str, Array], more: Mapping[str, Any]
+) -> Stream:
+    """Return the truth of rows (n,) that have those of :data:`BODY`.
+
+    Parameters
+    ----------
+    wheels, of_wheels : names, and quantities (n, wheels) by name
+    more : channels (n,), other ones or in place of those of the body
+    """
+    columns: dict[str, Any] = {name: rows[name] for name in BODY.names or ()}
+    for quantity, values in of_wheels.items():
+        columns |= zip(wheel_channels(quantity, wheels), values.T, strict=True)
+    columns |= more
     return Stream(time_s, np.column_stack(list(columns.values())), tuple(columns))
-
-
-def wheels_truth(motion: Motion, gyro_bias_radps: Array, gyro_time_s: Array) -> Stream:
-    """Return the truth of a motion at :data:`TRUTH_HZ`; a slip that is never defined has no channel."""
-    time_s, at = motion.at(TRUTH_HZ)
-    rows = motion.record[at]
-    columns: dict[str, Array] = {}
-    for quantity in _WHEEL_TRUTH:
-        columns |= zip(wheel_channels(quantity, "123"), rows["wheels"][quantity].T, strict=True)
-    columns = {name: column for name, column in columns.items() if np.isfinite(column).any()}
-    return truth_stream(time_s, rows, columns | {GYRO_BIAS: np.interp(time_s, gyro_time_s, gyro_bias_radps)})

@@ -34,11 +34,11 @@ from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.kernels import filled, inner, njit, numbers, record
-from terrain.logs.schema import GNSS_CHANNELS
+from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
 from terrain.records import Array, Label, Stream
 from terrain.robots import BicycleRobot, Robot, as_drive
 from terrain.simulation.scenario import Conditions
-from terrain.simulation.sensors import BODY, over_ground, truth_stream, white_imu
+from terrain.simulation.sensors import BODY, fixes, imu_values, tilted_imu, truth_stream
 from terrain.slip import slip_angle
 
 STEP_S, LONGEST_DELAY_S = 0.001, 0.3  # length of a step, and the longest dead time of the steering
@@ -227,16 +227,10 @@ def advance(
         rows[row] = state[0].body
 
 
-class SensorNoise(NamedTuple):
-    """Standard deviations of white noise of each sample."""
-
-    speed_mps: float = 0.02
-    steer_rad: float = 0.002
-    gyro_radps: float = 0.003
-    accel_mps2: float = 0.1
-    tilt_rad: float = 0.003
-    position_m: float = 0.02
-    yaw_rad: float = 0.005
+# Standard deviations of white noise of each sample: of the IMU's rates, force and tilt, of fixes and compass, and of
+# speed and steering.
+GYRO_RADPS, ACCEL_MPS2, TILT_RAD, FIX_M, COMPASS_RAD = 0.003, 0.1, 0.003, 0.02, 0.005
+SPEED_MPS, STEER_RAD = 0.02, 0.002
 
 
 class CarDrive(NamedTuple):
@@ -269,24 +263,6 @@ class CarCommand(NamedTuple):
 Controller = Callable[[CarSample], CarCommand]
 
 
-class _Stops:
-    """The desired speed of a drive, of what was driven so far."""
-
-    def __init__(self, drive: CarDrive) -> None:
-        self._drive, self._next, self._stood_s = drive, 0, 0.0
-
-    def desired(self, distance_m: float, speed_mps: float) -> float:
-        stops = self._drive.stops
-        if self._next < len(stops):
-            where_m, stand_s = stops[self._next]
-            if distance_m + speed_mps**2 / (2 * SETTINGS["acceleration_mps2"]) >= where_m:
-                self._stood_s += TICK_S if speed_mps == 0.0 else 0.0
-                if self._stood_s <= stand_s:
-                    return 0.0
-                self._next, self._stood_s = self._next + 1, 0.0
-        return self._drive.speed_mps
-
-
 def run_car(
     robot: Robot,
     drive: CarDrive,
@@ -296,7 +272,6 @@ def run_car(
     conditions: Conditions,
     effects: Mapping[str, float],
     controller: Controller,
-    noise: SensorNoise = SensorNoise(),  # noqa: B008
 ) -> tuple[dict[str, Stream], tuple[Label, ...]]:
     """Return streams and labels of a drive, for :func:`terrain.simulation.run.simulate`, which describes the rest.
 
@@ -318,19 +293,33 @@ def run_car(
         raise ConfigError(
             f"speed is {drive.speed_mps:g} m/s, 0 to {robot.speed_max_mps:g} is the robot's range"
         )
-    stops, state = _Stops(drive), initial_state(*drive.start)
+    state, stops, stood_s = initial_state(*drive.start), list(drive.stops), 0.0
     per_tick, n_ticks = round(TICK_S / TRUTH_S), max(2, int(drive.duration_s / TICK_S))
-    rows, steps = np.empty(1 + n_ticks * per_tick, CAR_BODY), round(TRUTH_S / STEP_S)
-    body = state["body"][0]
+    rows, steps, body = np.empty(1 + n_ticks * per_tick, CAR_BODY), round(TRUTH_S / STEP_S), state["body"][0]
     body["roll_rad"] = grid[0, 1]
     rows[0] = body
-    std = [noise.speed_mps, noise.steer_rad, noise.position_m, noise.position_m, noise.yaw_rad]
-    std += [noise.gyro_radps, noise.tilt_rad, noise.accel_mps2]
+    std = [SPEED_MPS, STEER_RAD, FIX_M, FIX_M, COMPASS_RAD, GYRO_RADPS, TILT_RAD, ACCEL_MPS2]
     measured, commands = rng.standard_normal((n_ticks, len(CAR_ROWS))) * std, np.empty((n_ticks, 2))
+
+    def lateral(of: Array) -> Array:
+        """Return the lateral specific force above the rear axle."""
+        return np.asarray(of["accel_y_mps2"] - robot.com_ahead_m * of["yaw_accel_radps2"])
+
     for k in range(n_ticks):
-        desired = stops.desired(float(body["distance_m"]), float(body["speed_mps"]))
-        row = _measure(measured[k], body, robot, fixed=k % round(FIX_S / TICK_S) == 0)
-        asked = controller(CarSample(k * TICK_S, row, desired))
+        desired, speed = drive.speed_mps, float(body["speed_mps"])
+        if stops and body["distance_m"] + speed**2 / (2 * SETTINGS["acceleration_mps2"]) >= stops[0][0]:
+            stood_s += TICK_S if speed == 0.0 else 0.0
+            if stood_s <= stops[0][1]:
+                desired = 0.0
+            else:
+                stops, stood_s = stops[1:], 0.0
+        row = measured[k]
+        row += (*(body[name] for name in _MEASURED), lateral(body))
+        row[0] *= speed != 0.0  # the encoder of a wheel that stands counts nothing
+        row[4] = wrapped(float(row[4]))
+        if k % round(FIX_S / TICK_S):
+            row[2:5] = np.nan
+        asked = controller(CarSample(k * TICK_S, row.copy(), desired))
         if not np.isfinite(asked[:2]).all():
             raise ConfigError(f"the controller commands {asked[:2]} after {k * TICK_S:.2f} s")
         commands[k] = asked[:2]
@@ -340,80 +329,52 @@ def run_car(
             n_ticks = k + 1
             break
     time_s, measured, rows = np.arange(n_ticks) * TICK_S, measured[:n_ticks], rows[: n_ticks * per_tick]
-    fixed, at_rear = np.isfinite(measured[:, 2]), _rear_axle(rows, robot)
-    speeds = over_ground(at_rear[::per_tick][fixed])
-    speeds += rng.standard_normal(speeds.shape) * noise.position_m / FIX_S
-    known = np.ones((len(speeds), 1))
-    fixes = np.column_stack([measured[fixed, 2:4], speeds, noise.position_m * known, known])
-    streams = {
-        "wheels": Stream(time_s, measured[:, :1], ("speed_rear_mps",)),
-        "steering": Stream(time_s, measured[:, 1:2], ("angle_front_rad",)),
-        "gnss": Stream(time_s[fixed], fixes, GNSS_CHANNELS),
-        "compass": Stream(time_s[fixed], measured[fixed, 4:5], ("yaw_rad",)),
-        "imu": _imu(rows, measured, robot, noise, rng),
-        "commands": Stream(time_s, commands[:n_ticks], ("steer_front_rad", "speed_x_mps")),
-        "truth": _truth(rows, at_rear, robot),
-    }
-    return streams, ()
-
-
-def _measure(row: Array, body: Array, robot: BicycleRobot, fixed: bool) -> Array:
-    """Add what is measured of a body to the noise of a tick, and return a copy of it."""
-    row += (*(body[name] for name in _MEASURED), _lateral(body, robot))
-    if body["speed_mps"] == 0.0:
-        row[0] = 0.0  # the encoder of a wheel that stands counts nothing
-    row[4] = wrapped(float(row[4]))
-    if not fixed:
-        row[2:5] = np.nan
-    return np.array(row)
-
-
-def _lateral(rows: Array, robot: BicycleRobot) -> Array:
-    """Return the lateral specific force above the rear axle."""
-    return np.asarray(rows["accel_y_mps2"] - robot.com_ahead_m * rows["yaw_accel_radps2"])
-
-
-def _rear_axle(rows: Array, robot: BicycleRobot) -> Array:
-    """Return the body (n,) at the rear axle, of :data:`~terrain.simulation.sensors.BODY`."""
-    body = np.zeros(len(rows), BODY)
+    truth_s, none, turn, roll = (
+        np.arange(len(rows)) * TRUTH_S,
+        np.zeros(len(rows)),
+        rows["yaw_rate_radps"],
+        rows["roll_rad"],
+    )
+    at_rear = np.zeros(len(rows), BODY)
     for name in set(BODY.names or ()) & set(CAR_BODY.names or ()):
-        body[name] = rows[name]
-    body["speed_x_mps"] = rows["speed_mps"]
-    body["speed_y_mps"] = rows["side_speed_mps"] - robot.com_ahead_m * rows["yaw_rate_radps"]
-    return body
-
-
-def _truth(rows: Array, at_rear: Array, robot: BicycleRobot) -> Stream:
-    """Return the truth; pose and speed ahead are of the rear axle, all else of the centre of mass, slip NaN at rest."""
-    ahead, left, steer = at_rear["speed_x_mps"], at_rear["speed_y_mps"], rows["steer_rad"]
-    at_front = left + robot.wheelbase_m * rows["yaw_rate_radps"]
-    cos, sin = np.cos(steer), np.sin(steer)
-    columns = {
+        at_rear[name] = rows[name]
+    at_rear["speed_x_mps"] = ahead = rows["speed_mps"]
+    at_rear["speed_y_mps"] = left = rows["side_speed_mps"] - robot.com_ahead_m * turn
+    fixed = np.isfinite(measured[:, 2])
+    noise = rng.standard_normal((int(fixed.sum()), 2)) * FIX_M / FIX_S
+    located = fixes(at_rear[::per_tick][fixed], np.hstack([np.zeros_like(noise), noise]), FIX_M)
+    located[:, :2] = measured[fixed, 2:4]
+    true = tilted_imu(
+        np.column_stack([rows["roll_rate_radps"], none, turn]),
+        np.column_stack(
+            [
+                rows["accel_x_mps2"] - rows["side_speed_mps"] * turn,
+                lateral(rows) - GRAVITY_MPS2 * np.sin(roll),
+            ]
+        ),
+        np.column_stack([roll, none, rows["yaw_rad"]]),
+    )
+    drawn = rng.standard_normal((len(rows), 9)) * np.repeat([GYRO_RADPS, ACCEL_MPS2, TILT_RAD], 3)
+    imu = imu_values(true, 1.0, 0.0, drawn)
+    imu[::per_tick, [2, 6, 4]] = measured[:, 5:]  # at the ticks what the controller got
+    at_front, cos, sin = left + robot.wheelbase_m * turn, np.cos(rows["steer_rad"]), np.sin(rows["steer_rad"])
+    # pose and speed ahead are of the rear axle, all else of the centre of mass, slip NaN at rest
+    more = {
         "yaw_rad": wrapped(rows["yaw_rad"]),
         "speed_y_mps": rows["side_speed_mps"],
         "slip_front_rad": slip_angle(ahead * cos + at_front * sin, at_front * cos - ahead * sin),
         "slip_rear_rad": slip_angle(ahead, left),
         **{name: rows[name] for name in ("side_front_n", "side_rear_n")},
-        "steer_front_rad": steer,
+        "steer_front_rad": rows["steer_rad"],
         "distance_m": rows["distance_m"],
     }
-    return truth_stream(np.arange(len(rows)) * TRUTH_S, at_rear, columns)
-
-
-def _imu(
-    rows: Array, measured: Array, robot: BicycleRobot, noise: SensorNoise, rng: np.random.Generator
-) -> Stream:
-    """Return gyro, specific force and attitude; at the ticks they are what the controller got."""
-    std = np.repeat([noise.gyro_radps, noise.accel_mps2, noise.tilt_rad], 3)
-    none, turn, roll = np.zeros(len(rows)), rows["yaw_rate_radps"], rows["roll_rad"]
-    lateral = _lateral(rows, robot) - GRAVITY_MPS2 * np.sin(roll)
-    drawn = white_imu(
-        np.arange(len(rows)) * TRUTH_S,
-        np.column_stack([rows["roll_rate_radps"], none, turn]),
-        np.column_stack([rows["accel_x_mps2"] - rows["side_speed_mps"] * turn, lateral]),
-        np.column_stack([roll, none, rows["yaw_rad"]]),
-        rng.standard_normal((len(rows), 9)) * std,
-    )
-    values = np.array(drawn.values)
-    values[:: round(TICK_S / TRUTH_S), [2, 6, 4]] = measured[:, 5:]
-    return Stream(drawn.time_s, values, drawn.channels)
+    streams = {
+        "wheels": Stream(time_s, measured[:, :1], ("speed_rear_mps",)),
+        "steering": Stream(time_s, measured[:, 1:2], ("angle_front_rad",)),
+        "gnss": Stream(time_s[fixed], located, GNSS_CHANNELS),
+        "compass": Stream(time_s[fixed], measured[fixed, 4:5], ("yaw_rad",)),
+        "imu": Stream(truth_s, imu, IMU_CHANNELS),
+        "commands": Stream(time_s, commands[:n_ticks], ("steer_front_rad", "speed_x_mps")),
+        "truth": truth_stream(truth_s, at_rear, (), {}, more),
+    }
+    return streams, ()

@@ -41,7 +41,7 @@ States are integrated with semi-implicit steps of :data:`STEP_S`.  What acts, in
 
 - **load**: three contacts carry a rigid body, so their normal forces follow from balance alone:
   ``sum N = m g cos``, and the moments of gravity and inertia about the two body axes; tyres as springs over
-  a rough ground add their own (:func:`ride_over`).
+  a rough ground add their own.
 - **steering**: a rate-limited, acceleration-limited motor turns the wheel through a backlash of half width
   ``dead_band``.
 - **speed loop** of each motor driver: PI on its own estimate of the wheel's rate, torque limit with
@@ -72,7 +72,6 @@ delay later, one step at the least.
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -91,21 +90,9 @@ from terrain.kinematics.wheels import point_velocity
 from terrain.logs.schema import unit_of
 from terrain.records import Array, Command, Label, Sample, Stream
 from terrain.robots import Robot, SwerveRobot, as_drive
+from terrain.simulation import sensors as sensing
 from terrain.simulation.scenario import Conditions, Faults, Scenario
-from terrain.simulation.sensors import (
-    BODY_ROW,
-    STEP_S,
-    Gnss,
-    Motion,
-    Sensor,
-    camera_sensor,
-    generators,
-    gnss_sensor,
-    imu_sensor,
-    steering_sensor,
-    wheel_sensor,
-    wheels_truth,
-)
+from terrain.simulation.sensors import BODY_ROW, STEP_S, Gnss, Motion
 from terrain.terramechanics.soil import Soil
 from terrain.terramechanics.traction import GROUND, ground_record, wheel_ground
 
@@ -177,13 +164,6 @@ class TerrainProfile(NamedTuple):
     field: Array  # (2, 3, cells) factors along the path on thrust and on resistance, for each wheel
 
 
-def uniform_profile(
-    robot: Robot, *soils: Soil, roughness_m3: float = 0.0, start_m: tuple[float, ...] = (0.0,)
-) -> TerrainProfile:
-    """Return a terrain of one soil a patch without variation along the path, all patches equally rough."""
-    return TerrainProfile(_patches(robot, soils, [roughness_m3] * len(soils), start_m), np.ones((2, 3, 1)))
-
-
 def draw_profile(
     robot: Robot,
     scenario: Scenario,
@@ -220,18 +200,17 @@ def draw_profile(
     spread = ratios[patch_of_cell].T
     field = np.exp(spread[:, None, :] * unit - 0.5 * spread[:, None, :] ** 2)
     roughness = [soil.roughness_m3 * conditions.roughness_factor for soil in used]
-    return TerrainProfile(_patches(robot, used, roughness, start_m), field)
+    return TerrainProfile(patches_on(robot, used, roughness, start_m), field)
 
 
-def _patches(
+def patches_on(
     robot: Robot, soils: Sequence[Soil], roughness_m3: Sequence[float], start_m: Sequence[float] | Array
 ) -> Array:
-    body = robot.equipment.body
-    patches = np.zeros(len(soils), PATCH)
+    """Return soils under the wheels of a robot, with their roughness and starts, (soils,) of :data:`PATCH`."""
+    body, patches = robot.equipment.body, np.zeros(len(soils), PATCH)
+    wheel = robot.wheel_radius_m, body.tyre_width_m, body.contact_length_m
     for patch, soil in zip(patches, soils, strict=True):
-        (patch["ground"],) = ground_record(
-            soil, robot.wheel_radius_m, body.tyre_width_m, body.contact_length_m
-        )
+        (patch["ground"],) = ground_record(soil, *wheel)
     patches["roughness_m3"], patches["start_m"] = roughness_m3, start_m
     return patches
 
@@ -253,27 +232,6 @@ def make_plant(robot: Robot, conditions: Conditions) -> Array:
     rolling = (1.0 + effects["wheel_radius_ratio"]) * np.array([1.0 - half, 1.0 - half, 1.0 + half])
     offset_m = conditions.payload_kg / mass_kg * np.asarray(conditions.payload_m)
     com_m = np.array([body.com_x_m, body.com_y_m]) + offset_m
-    load_fraction, load_per_moment = _load_shares(robot, conditions, com_m)
-    of_robot = {
-        "wheels_m": robot.wheel_positions_m,
-        "com_m": com_m,
-        "mass_kg": mass_kg,
-        "weight_n": robot.mass_kg * GRAVITY_MPS2,
-        "yaw_inertia_kgm2": body.yaw_inertia_kgm2 * mass_kg / robot.mass_kg,
-        "radius_m": robot.wheel_radius_m * np.array(conditions.radius_factors) * rolling,
-        "load_fraction": load_fraction,
-        "load_per_force_ratio": -body.com_height_m * load_per_moment,
-        "hall_steps": sensors.hall_steps_ratio * motors.reduction_ratio / (2 * math.pi),
-        "linked": any(effects[name] != 0.0 for name in in_plant(Stage.LINKAGE)),
-        "steer_offset_rad": [effects[f"steering_offset_{i}_rad"] for i in (1, 2, 3)],
-        "yields": any(effects[name] != 0.0 for name in in_plant(Stage.CONTACT)),
-        "effects": vector_of(effects).view(EFFECTS),
-    }
-    return filled(PLANT, **(described | of_robot))
-
-
-def _load_shares(robot: Robot, conditions: Conditions, com_m: Array) -> tuple[Array, Array]:
-    """Return the load (3,) of each wheel over the weight, and per moment about the two body axes (3, 2)."""
     # Rows: vertical force, moment about y (x arm), moment about x (y arm); columns: the three wheels.
     inverse = np.linalg.inv(np.vstack([np.ones(3), robot.wheel_positions_m.T]))
     load_fraction = inverse @ np.array([1.0, com_m[0], com_m[1]])
@@ -284,7 +242,22 @@ def _load_shares(robot: Robot, conditions: Conditions, com_m: Array) -> tuple[Ar
             f"from the centre of mass tips it over: wheel {int(load_fraction.argmin()) + 1} would carry "
             "nothing"
         )
-    return load_fraction, inverse[:, 1:]
+    of_robot = {
+        "wheels_m": robot.wheel_positions_m,
+        "com_m": com_m,
+        "mass_kg": mass_kg,
+        "weight_n": robot.mass_kg * GRAVITY_MPS2,
+        "yaw_inertia_kgm2": body.yaw_inertia_kgm2 * mass_kg / robot.mass_kg,
+        "radius_m": robot.wheel_radius_m * np.array(conditions.radius_factors) * rolling,
+        "load_fraction": load_fraction,
+        "load_per_force_ratio": -body.com_height_m * inverse[:, 1:],
+        "hall_steps": sensors.hall_steps_ratio * motors.reduction_ratio / (2 * math.pi),
+        "linked": any(effects[name] != 0.0 for name in in_plant(Stage.LINKAGE)),
+        "steer_offset_rad": [effects[f"steering_offset_{i}_rad"] for i in (1, 2, 3)],
+        "yields": any(effects[name] != 0.0 for name in in_plant(Stage.CONTACT)),
+        "effects": vector_of(effects).view(EFFECTS),
+    }
+    return filled(PLANT, **(described | of_robot))
 
 
 def start_state(steer_rad: Array) -> Array:
@@ -353,9 +326,7 @@ LEG_RATE_RADPS = (
 LEG_FRICTION_NM = 5.0
 LEAST_CREEP = -0.9  # least creep over the slip of the ground
 ROUGHNESS_WAVENUMBER = 0.1  # reference wave number of ISO 8608 in cycles/m
-ROUGHNESS_CUTOFF = (
-    0.01  # longest wave of the ground that counts as roughness, in cycles/m (ISO 8608's lower end)
-)
+ROUGHNESS_CUTOFF = 0.01  # longest wave that counts as roughness, in cycles/m (ISO 8608's lower end)
 
 
 def settle(plant: Array, profile: TerrainProfile, state: Array) -> None:
@@ -365,9 +336,9 @@ def settle(plant: Array, profile: TerrainProfile, state: Array) -> None:
     nothing. For four of five seconds the speeds are taken away ten times a second, so that it does not swing;
     where it rests afterwards is the origin.  Terrain too steep to stand on lets it slide.
     """
-    stand, rows = np.zeros((1, 3)), np.empty(100, BODY_ROW)
+    still, rows = np.zeros((100, 3)), np.empty(100, BODY_ROW)
     for tenth in range(50):
-        advance(plant, profile, state, stand, stand, 100, np.zeros((100, 3)), rows)
+        advance(plant, profile, state, still, still, still, rows)
         if tenth < 40:
             state["speed_x_mps"] = state["speed_y_mps"] = state["yaw_rate_radps"] = 0.0
     for name in ("position_x_m", "position_y_m", "yaw_rad", "path_m"):
@@ -381,24 +352,21 @@ def advance(
     state: Array,
     wheel_radps: Array,
     steer_rad: Array,
-    substeps: int,
     road_noise: Array,
     rows: Array,
 ) -> None:
-    """Drive through commands that are held for ``substeps`` steps each; ``state`` is changed in place.
+    """Drive through the commands of each step of :data:`STEP_S`; ``state`` is changed in place.
 
     Parameters
     ----------
-    plant, profile, state : as :func:`~terrain.simulation.plants.dynamic.make_plant`, ``draw_profile`` and
-        ``start_state`` give them; or a state as an earlier call left it
+    plant, profile, state : as :func:`make_plant`, :func:`draw_profile` and :func:`start_state` give them; or a state as
+        an earlier call left it
     wheel_radps, steer_rad : (n, 3) commands
-    substeps : steps of :data:`STEP_S` a command
-    road_noise : (n * substeps, 3) standard normal numbers, the roughness under each wheel
-    rows : (n * substeps,) of :data:`~terrain.simulation.sensors.BODY_ROW`, is written
+    road_noise : (n, 3) standard normal numbers, the roughness under each wheel
+    rows : (n,) of :data:`~terrain.simulation.sensors.BODY_ROW`, is written
     """
-    for k in range(wheel_radps.shape[0] * substeps):
-        held = k // substeps
-        step(plant[0], profile, state[0], wheel_radps[held], steer_rad[held], road_noise[k], rows[k], STEP_S)
+    for k in range(rows.size):
+        step(plant[0], profile, state[0], wheel_radps[k], steer_rad[k], road_noise[k], rows[k], STEP_S)
 
 
 @inner
@@ -413,142 +381,104 @@ def step(
     dt: float,
 ) -> None:
     """Step all wheels, then the body that they carry; the row is that of the start of the step."""
+    # the gradient of the ground in body axes, uphill positive
     cos_yaw, sin_yaw = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
-    grade_x, grade_y = terrain_gradient(plant, state.path_m, cos_yaw, sin_yaw)
+    undulation = plant.undulation_ratio * math.sin(2 * math.pi * state.path_m / plant.undulation_length_m)
+    world_x, world_y = plant.grade_ratio[0] + undulation, plant.grade_ratio[1]
+    grade_x, grade_y = cos_yaw * world_x + sin_yaw * world_y, -sin_yaw * world_x + cos_yaw * world_y
     steepness = math.sqrt(1.0 + grade_x * grade_x + grade_y * grade_y)
     row.grade_x_ratio, row.grade_y_ratio = grade_x, grade_y
     force_x, force_y, moment, leg_nm = 0.0, 0.0, 0.0, 0.0
+    com_x, com_y, sigma_m = plant.com_m[0], plant.com_m[1], plant.relaxation_length_m
+    cell = min(max(int(state.path_m / FIELD_STEP_M), 0), profile.field.shape[2] - 1)  # a NaN is no place
     for i in range(3):
-        steer_wheel(plant, state.wheels[i], steer_rad[i], dt)
-        fx, fy = _wheel_force(plant, profile, state, i, steepness, wheel_radps[i], noise[i], row, dt)
+        w, out, radius_m = state.wheels[i], row.wheels[i], plant.radius_m[i]
+        _steer_wheel(plant, w, steer_rad[i], dt)
+        heading = row.encoder_rad[i] = w.steer_rad
+        if plant.linked:  # delay, play and offset of its linkage
+            late, play = w.steer_rad, plant.effects.steering_backlash_rad
+            delay_steps = round(plant.effects.steering_delay_s / dt)
+            if delay_steps > 0:
+                place = state.n_steps % delay_steps
+                late, state.late_rad[place, i] = state.late_rad[place, i], w.steer_rad
+            w.heading_rad = min(max(w.heading_rad, late - play), late + play)
+            heading = w.heading_rad + plant.steer_offset_rad[i]
+        if i == 2 and plant.leg_backlash_rad > 0.0:
+            heading += state.leg_rad
+        # speed of the wheel's centre, along the wheel and across it
+        x_m, y_m = plant.wheels_m[i, 0] - com_x, plant.wheels_m[i, 1] - com_y
+        v_x, v_y = point_velocity(state.speed_x_mps, state.speed_y_mps, state.yaw_rate_radps, x_m, y_m)
+        cos_steer, sin_steer = math.cos(heading), math.sin(heading)
+        along = cos_steer * v_x + sin_steer * v_y
+        across = -sin_steer * v_x + cos_steer * v_y
+        wheel_speed = w.rate_radps * radius_m
+        fastest = max(abs(wheel_speed), abs(along))
+        # the patch that the wheel is on lies ahead of the body's by its place in the direction of motion
+        speed = (
+            math.sqrt(state.speed_x_mps * state.speed_x_mps + state.speed_y_mps * state.speed_y_mps) + 1e-9
+        )
+        ahead_m = (
+            plant.wheels_m[i, 0] * state.speed_x_mps + plant.wheels_m[i, 1] * state.speed_y_mps
+        ) / speed
+        at_m, patch = state.path_m + (ahead_m if speed > 0.05 else 0.0), 0
+        while patch + 1 < profile.patches.size and at_m >= profile.patches[patch + 1].start_m:
+            patch += 1
+        ground = profile.patches[patch].ground
+        rolled = math.sqrt(along * along + across * across)
+        ride_n = _ride_over(plant, w, i, profile.patches[patch].roughness_m3, rolled, noise[i], dt)
+        normal_n = plant.mass_kg * (
+            GRAVITY_MPS2 / steepness * plant.load_fraction[i]
+            + plant.load_per_force_ratio[i, 0] * (state.accel_x_mps2 + GRAVITY_MPS2 * grade_x / steepness)
+            + plant.load_per_force_ratio[i, 1] * (state.accel_y_mps2 + GRAVITY_MPS2 * grade_y / steepness)
+        )
+        w.ride_mps2 = ride_n / (plant.mass_kg * plant.load_fraction[i])
+        normal_n = max(normal_n + ride_n, 0.0)
+        rate_x = wheel_speed - along - fastest / sigma_m * w.deflection_x_m
+        rate_y = -across - fastest / sigma_m * w.deflection_y_m
+        if plant.yields:
+            rate_x -= w.creep_ratio * fastest / sigma_m * w.deflection_x_m
+            rate_y -= plant.effects.side_hill_slip_ratio * math.atan(grade_y) * abs(along)
+        slip_x = (w.deflection_x_m + DEFLECTION_DAMPING_S * rate_x) / sigma_m
+        slip_y = (w.deflection_y_m + DEFLECTION_DAMPING_S * rate_y) / sigma_m
+        thrust, side, resistance, sinkage = wheel_ground(
+            ground, normal_n, min(max(slip_x, -1.0), 1.0), slip_y
+        )
+        thrust *= profile.field[0, i, cell]
+        side *= profile.field[0, i, cell]
+        resistance *= profile.field[1, i, cell]
+        if plant.yields:
+            w.creep_ratio = _creep(plant, ground, normal_n, slip_x, thrust)
+            slip = abs(slip_x) * (1.0 + w.creep_ratio)
+            more = plant.effects.rolling_resistance_ratio + plant.effects.slip_resistance_ratio * slip
+            resistance += more * normal_n
+            resistance = max(resistance + plant.effects.viscous_drag_nspm * abs(along) / 3.0, 0.0)
+        pull = thrust - resistance * math.tanh(along / ROLLING_SPEED_MPS)
+        _drive_wheel(plant, w, wheel_radps[i], thrust * radius_m, dt)
+        # the contact follows with the wheel's new rate: semi-implicit
+        rate_x = w.rate_radps * radius_m - along - fastest / sigma_m * w.deflection_x_m
+        deflection = w.deflection_x_m + dt * rate_x
+        if plant.yields:  # implicit: a contact that creeps fast is stiff
+            deflection /= 1.0 + dt * (w.creep_ratio * fastest / sigma_m)
+        w.deflection_x_m = min(max(deflection, -sigma_m), sigma_m)
+        w.deflection_y_m = min(max(w.deflection_y_m + dt * rate_y, -sigma_m), sigma_m)
+        out.wheel_radps, out.steer_rad = wheel_speed / radius_m, heading  # of this instant, as the slip is
+        out.slip_ratio = (wheel_speed - along) / fastest if fastest >= 0.05 else np.nan
+        out.slip_angle_rad = math.atan2(across, abs(along)) if math.hypot(along, across) >= 0.05 else np.nan
+        out.normal_n, out.traction_n, out.side_n, out.torque_nm = normal_n, thrust, side, w.torque_nm
+        out.sinkage_m, out.reported_radps, out.patch_ratio = sinkage, w.reported_radps, patch
+        f_x, f_y = cos_steer * pull - sin_steer * side, sin_steer * pull + cos_steer * side
         if i == 2:
-            leg_nm = -plant.wheels_m[i, 1] * fx
-        force_x += fx
-        force_y += fy
-        moment += (plant.wheels_m[i, 0] - plant.com_m[0]) * fy - (plant.wheels_m[i, 1] - plant.com_m[1]) * fx
+            leg_nm = -plant.wheels_m[i, 1] * f_x
+        force_x += f_x
+        force_y += f_y
+        moment += x_m * f_y - y_m * f_x
     state.n_steps += 1
     accel_x = force_x / plant.mass_kg - GRAVITY_MPS2 * grade_x / steepness
     accel_y = force_y / plant.mass_kg - GRAVITY_MPS2 * grade_y / steepness
-    spin = moment / plant.yaw_inertia_kgm2
-    _write_body(plant, state, accel_x, accel_y, spin, row)
-    _step_body(plant, state, accel_x, accel_y, spin, cos_yaw, sin_yaw, dt)
-    if plant.leg_backlash_rad > 0.0:
-        state.leg_rad = _swing(plant, state.leg_rad, leg_nm, dt)
-
-
-@inner
-def _wheel_force(
-    plant: Any,
-    profile: TerrainProfile,
-    state: Any,
-    i: int,
-    steepness: float,
-    command_radps: float,
-    noise: float,
-    row: Any,
-    dt: float,
-) -> tuple[float, float]:
-    """Step a steered wheel and its contact; return the force on the body along its axes."""
-    w, out, radius_m = state.wheels[i], row.wheels[i], plant.radius_m[i]
-    grade_x, grade_y = row.grade_x_ratio, row.grade_y_ratio
-    heading = w.steer_rad
-    row.encoder_rad[i] = w.steer_rad
-    if plant.linked:
-        heading = linkage_heading(plant, state, i, dt)
-    if i == 2 and plant.leg_backlash_rad > 0.0:
-        heading += state.leg_rad
-    # speed of the wheel's centre, along the wheel and across it
-    x_m, y_m = plant.wheels_m[i, 0] - plant.com_m[0], plant.wheels_m[i, 1] - plant.com_m[1]
-    v_x, v_y = point_velocity(state.speed_x_mps, state.speed_y_mps, state.yaw_rate_radps, x_m, y_m)
-    cos_steer, sin_steer = math.cos(heading), math.sin(heading)
-    along = cos_steer * v_x + sin_steer * v_y
-    across = -sin_steer * v_x + cos_steer * v_y
-    wheel_speed = w.rate_radps * radius_m
-    fastest = max(abs(wheel_speed), abs(along))
-    # the patch that the wheel is on lies ahead of the body's by its place in the direction of motion
-    speed = math.sqrt(state.speed_x_mps * state.speed_x_mps + state.speed_y_mps * state.speed_y_mps) + 1e-9
-    ahead_m = (plant.wheels_m[i, 0] * state.speed_x_mps + plant.wheels_m[i, 1] * state.speed_y_mps) / speed
-    patch = patch_index(profile.patches, state.path_m + (ahead_m if speed > 0.05 else 0.0))
-    ground = profile.patches[patch].ground
-    rolled = math.sqrt(along * along + across * across)
-    ride_n = ride_over(plant, w, i, profile.patches[patch].roughness_m3, rolled, noise, dt)
-    normal_n = plant.mass_kg * (
-        GRAVITY_MPS2 / steepness * plant.load_fraction[i]
-        + plant.load_per_force_ratio[i, 0] * (state.accel_x_mps2 + GRAVITY_MPS2 * grade_x / steepness)
-        + plant.load_per_force_ratio[i, 1] * (state.accel_y_mps2 + GRAVITY_MPS2 * grade_y / steepness)
-    )
-    w.ride_mps2 = ride_n / (plant.mass_kg * plant.load_fraction[i])
-    normal_n = max(normal_n + ride_n, 0.0)
-    rate_x = wheel_speed - along - fastest / plant.relaxation_length_m * w.deflection_x_m
-    rate_y = -across - fastest / plant.relaxation_length_m * w.deflection_y_m
-    if plant.yields:
-        rate_x -= w.creep_ratio * fastest / plant.relaxation_length_m * w.deflection_x_m
-        rate_y -= plant.effects.side_hill_slip_ratio * math.atan(grade_y) * abs(along)
-    slip_x = (w.deflection_x_m + DEFLECTION_DAMPING_S * rate_x) / plant.relaxation_length_m
-    slip_y = (w.deflection_y_m + DEFLECTION_DAMPING_S * rate_y) / plant.relaxation_length_m
-    thrust, side, resistance, sinkage = wheel_ground(ground, normal_n, min(max(slip_x, -1.0), 1.0), slip_y)
-    cell = min(max(int(state.path_m / FIELD_STEP_M), 0), profile.field.shape[2] - 1)  # a NaN is no place
-    thrust *= profile.field[0, i, cell]
-    side *= profile.field[0, i, cell]
-    resistance *= profile.field[1, i, cell]
-    if plant.yields:
-        w.creep_ratio = _creep(plant, ground, normal_n, slip_x, thrust)
-        slip = abs(slip_x) * (1.0 + w.creep_ratio)
-        resistance += (
-            plant.effects.rolling_resistance_ratio + plant.effects.slip_resistance_ratio * slip
-        ) * normal_n
-        resistance = max(resistance + plant.effects.viscous_drag_nspm * abs(along) / 3.0, 0.0)
-    pull = thrust - resistance * math.tanh(along / ROLLING_SPEED_MPS)
-    drive_wheel(plant, w, command_radps, thrust * radius_m, dt)
-    # the contact follows with the wheel's new rate: semi-implicit
-    rate_x = w.rate_radps * radius_m - along - fastest / plant.relaxation_length_m * w.deflection_x_m
-    limit = plant.relaxation_length_m
-    deflection = w.deflection_x_m + dt * rate_x
-    if plant.yields:  # implicit: a contact that creeps fast is stiff
-        deflection /= 1.0 + dt * (w.creep_ratio * fastest / plant.relaxation_length_m)
-    w.deflection_x_m = min(max(deflection, -limit), limit)
-    w.deflection_y_m = min(max(w.deflection_y_m + dt * rate_y, -limit), limit)
-    out.wheel_radps = wheel_speed / radius_m  # of this instant, as the slip is
-    out.steer_rad = heading
-    out.slip_ratio = (wheel_speed - along) / fastest if fastest >= 0.05 else np.nan
-    out.slip_angle_rad = math.atan2(across, abs(along)) if math.hypot(along, across) >= 0.05 else np.nan
-    out.normal_n, out.traction_n, out.side_n, out.torque_nm = normal_n, thrust, side, w.torque_nm
-    out.sinkage_m, out.reported_radps, out.patch_ratio = sinkage, w.reported_radps, patch
-    return cos_steer * pull - sin_steer * side, sin_steer * pull + cos_steer * side
-
-
-@inner
-def _step_body(
-    plant: Any,
-    state: Any,
-    accel_x: float,
-    accel_y: float,
-    spin: float,
-    cos_yaw: float,
-    sin_yaw: float,
-    dt: float,
-) -> None:
-    """Step the body with the acceleration of its centre of mass and of its yaw."""
-    turn, vx, vy = state.yaw_rate_radps, state.speed_x_mps, state.speed_y_mps
-    state.speed_x_mps = vx + dt * (accel_x + turn * vy)
-    state.speed_y_mps = vy + dt * (accel_y - turn * vx)
-    state.yaw_rate_radps = turn + dt * spin
-    origin_x, origin_y = point_velocity(
-        state.speed_x_mps, state.speed_y_mps, state.yaw_rate_radps, -plant.com_m[0], -plant.com_m[1]
-    )
-    state.position_x_m += dt * (cos_yaw * origin_x - sin_yaw * origin_y)
-    state.position_y_m += dt * (sin_yaw * origin_x + cos_yaw * origin_y)
-    state.yaw_rad += dt * state.yaw_rate_radps
-    state.path_m += dt * math.sqrt(origin_x * origin_x + origin_y * origin_y)
-    state.accel_x_mps2, state.accel_y_mps2 = accel_x, accel_y
-
-
-@inner
-def _write_body(plant: Any, state: Any, accel_x: float, accel_y: float, spin: float, row: Any) -> None:
-    """Speeds and accelerations at the origin; the ride of the plane through the three corners."""
+    spin, turn = moment / plant.yaw_inertia_kgm2, state.yaw_rate_radps
+    # speeds and accelerations at the origin; the ride of the plane through the three corners
     base_m, track_m = plant.wheels_m[1, 0] - plant.wheels_m[0, 0], -plant.wheels_m[2, 1]
     one, two, three = state.wheels[0], state.wheels[1], state.wheels[2]
-    turn, com_x, com_y = state.yaw_rate_radps, plant.com_m[0], plant.com_m[1]
     row.position_x_m, row.position_y_m, row.yaw_rad = state.position_x_m, state.position_y_m, state.yaw_rad
     row.speed_x_mps, row.speed_y_mps = point_velocity(
         state.speed_x_mps, state.speed_y_mps, turn, -com_x, -com_y
@@ -562,6 +492,23 @@ def _write_body(plant: Any, state: Any, accel_x: float, accel_y: float, spin: fl
     row.ride_roll_radps2 = (0.5 * (one.ride_mps2 + two.ride_mps2) - three.ride_mps2) / track_m
     row.ride_pitch_radps2 = -(two.ride_mps2 - one.ride_mps2) / base_m
     row.path_m, row.leg_rad = state.path_m, state.leg_rad
+    # step the body with the acceleration of its centre of mass and of its yaw
+    vx, vy = state.speed_x_mps, state.speed_y_mps
+    state.speed_x_mps = vx + dt * (accel_x + turn * vy)
+    state.speed_y_mps = vy + dt * (accel_y - turn * vx)
+    state.yaw_rate_radps = turn + dt * spin
+    origin_x, origin_y = point_velocity(
+        state.speed_x_mps, state.speed_y_mps, state.yaw_rate_radps, -com_x, -com_y
+    )
+    state.position_x_m += dt * (cos_yaw * origin_x - sin_yaw * origin_y)
+    state.position_y_m += dt * (sin_yaw * origin_x + cos_yaw * origin_y)
+    state.yaw_rad += dt * state.yaw_rate_radps
+    state.path_m += dt * math.sqrt(origin_x * origin_x + origin_y * origin_y)
+    state.accel_x_mps2, state.accel_y_mps2 = accel_x, accel_y
+    if plant.leg_backlash_rad > 0.0 and abs(leg_nm) > LEG_FRICTION_NM:
+        # the third leg swings through its play to where its wheel is pushed, if that is hard enough
+        leg_rad = state.leg_rad + math.copysign(LEG_RATE_RADPS * dt, leg_nm)
+        state.leg_rad = min(max(leg_rad, -plant.leg_backlash_rad), plant.leg_backlash_rad)
 
 
 @njit
@@ -606,33 +553,7 @@ def _creep(plant: Any, ground: Any, normal_n: float, slip: float, thrust_n: floa
 
 
 @inner
-def _swing(plant: Any, leg_rad: float, moment_nm: float, dt: float) -> float:
-    """Swing the third leg through its play to where its wheel is pushed, if that is hard enough."""
-    if abs(moment_nm) <= LEG_FRICTION_NM:
-        return leg_rad
-    turned_rad = leg_rad + math.copysign(LEG_RATE_RADPS * dt, moment_nm)
-    return float(min(max(turned_rad, -plant.leg_backlash_rad), plant.leg_backlash_rad))
-
-
-@inner
-def terrain_gradient(plant: Any, path_m: float, cos_yaw: float, sin_yaw: float) -> tuple[float, float]:
-    """Return the gradient of the ground in body axes, uphill positive."""
-    undulation = plant.undulation_ratio * math.sin(2 * math.pi * path_m / plant.undulation_length_m)
-    world_x, world_y = plant.grade_ratio[0] + undulation, plant.grade_ratio[1]
-    return cos_yaw * world_x + sin_yaw * world_y, -sin_yaw * world_x + cos_yaw * world_y
-
-
-@inner
-def patch_index(patches: Array, path_m: float) -> int:
-    """Return the number of the patch at a path length."""
-    patch = 0
-    while patch + 1 < patches.size and path_m >= patches[patch + 1].start_m:
-        patch += 1
-    return patch
-
-
-@inner
-def ride_over(
+def _ride_over(
     plant: Any, w: Any, i: int, roughness_m3: float, speed: float, noise: float, dt: float
 ) -> float:
     """Move the corner on its tyre over the rough ground; return what that adds to the load."""
@@ -653,7 +574,7 @@ def ride_over(
 
 
 @inner
-def steer_wheel(plant: Any, w: Any, command_rad: float, dt: float) -> None:
+def _steer_wheel(plant: Any, w: Any, command_rad: float, dt: float) -> None:
     """Steering motor to its command with bounded rate and acceleration; the wheel hangs on it with play."""
     error = command_rad - w.steer_motor_rad
     # the rate from which the motor can still stop in time
@@ -671,23 +592,7 @@ def steer_wheel(plant: Any, w: Any, command_rad: float, dt: float) -> None:
 
 
 @inner
-def linkage_heading(plant: Any, state: Any, i: int, dt: float) -> float:
-    """Return the heading of a wheel behind delay, play and offset of its linkage."""
-    w = state.wheels[i]
-    late = w.steer_rad
-    delay_steps, backlash_rad = (
-        round(plant.effects.steering_delay_s / dt),
-        plant.effects.steering_backlash_rad,
-    )
-    if delay_steps > 0:
-        place = state.n_steps % delay_steps
-        late, state.late_rad[place, i] = state.late_rad[place, i], w.steer_rad
-    w.heading_rad = min(max(w.heading_rad, late - backlash_rad), late + backlash_rad)
-    return float(w.heading_rad + plant.steer_offset_rad[i])
-
-
-@inner
-def drive_wheel(plant: Any, w: Any, command_radps: float, load_nm: float, dt: float) -> None:
+def _drive_wheel(plant: Any, w: Any, command_radps: float, load_nm: float, dt: float) -> None:
     """Speed loop, motor and wheel; then the rate that the motor driver reports."""
     command = min(max(command_radps, -plant.speed_max_radps), plant.speed_max_radps)
     error = command - w.estimate_radps
@@ -723,6 +628,15 @@ COMMAND_CHANNELS = (
 """The admitted twist of the body, and what it asks of the wheels."""
 
 
+def built_with(robot: Robot, effects: Mapping[str, float]) -> Robot:
+    """Return the robot with all its effects, of which the commanded one lacks some."""
+    if not robot.effects and not effects:
+        return robot
+    acting = checked_effects("effects", {**robot.effects, **effects}, robot.drive)
+    extended = replace(robot, effects=acting, effects_cov=np.full((len(acting), len(acting)), np.nan))
+    return apply_homes(extended, in_plant(Stage.DESCRIPTION))
+
+
 def run_dynamic(
     robot: Robot,
     scenario: Scenario,
@@ -749,9 +663,25 @@ def run_dynamic(
     command_delay_s : from that instant to when the command is in force, in whole steps, one at least
     """
     robot = as_drive(SwerveRobot, robot, "robot {name}: drive {drive!r} is not simulated, only 'swerve' is")
-    substeps, delay_steps = _substeps(robot, scenario), _delay_steps(command_delay_s)
-    rngs = generators(seed, _PURPOSES)
-    built = _built(robot, effects)
+    substeps = round(1 / (scenario.rate_hz * STEP_S))
+    if abs(substeps * scenario.rate_hz * STEP_S - 1.0) > 1e-9:
+        raise ConfigError(
+            f"scenario {scenario.name}: rate_hz is {scenario.rate_hz:g}, it must divide {1 / STEP_S:g}"
+        )
+    on_board = {"camera": robot.equipment.camera, "sensors": robot.sensors}
+    for section, part in on_board.items():
+        for name in ("rate_hz", "wheels_rate_hz", "steering_rate_hz", "imu_rate_hz"):
+            if getattr(part, name, 0.0) > 1 / STEP_S:
+                raise ConfigError(
+                    f"robot {robot.name}: {section}: {name} is {getattr(part, name):g}, "
+                    f"at most {1 / STEP_S:g} is simulated"
+                )
+    is_number = isinstance(command_delay_s, int | float | np.integer | np.floating)
+    if not is_number or isinstance(command_delay_s, bool) or not 0 <= command_delay_s <= MAX_COMMAND_DELAY_S:
+        raise ConfigError(
+            f"command_delay_s is {command_delay_s!r}, a time from 0 to {MAX_COMMAND_DELAY_S:g} s is required"
+        )
+    rngs, built = sensing.generators(seed, _PURPOSES), built_with(robot, effects)
     profile = draw_profile(built, scenario, soils, conditions, rngs["terrain"])
     plant = make_plant(built, conditions)
     check_step(plant, profile, built.name)
@@ -760,185 +690,109 @@ def run_dynamic(
     settle(plant, profile, state)
     road_noise = rngs["road"].standard_normal((n_steps, 3))
     motion = Motion(np.empty(n_steps, BODY_ROW), 0)
-    sensors, gyro_bias_radps = _sensors(motion, built, faults, gnss, rngs)
-    status: dict[str, Array] = {}
-    if controller is None:
-        wheels = wheel_motion(robot, scenario.twist, 1 / scenario.rate_hz)
-        held = (wheels.wheel_radps, wheels.steer_rad, substeps)
-        advance(plant, profile, state, *held, road_noise, motion.record)
-        decided = np.hstack([wheels.twist, wheels.wheel_radps, wheels.steer_rad])
-    else:
-        drive = DrivenPlant(plant, profile, state, road_noise, motion.record)
-        decided, status = _in_loop(controller, delay_steps, scenario, substeps, drive, motion, sensors)
-    _check_motion(motion.record, robot)
-    motion.grow(n_steps)
-    for sensor in sensors.values():
-        sensor.update()
-    streams = {name: sensor.stream() for name, sensor in sensors.items() if len(sensor.time_s) > 1}
-    streams["commands"] = Stream(scenario.time_s, decided, COMMAND_CHANNELS)
-    if status:
-        streams["control"] = Stream(scenario.time_s, np.column_stack(list(status.values())), tuple(status))
-    streams["truth"] = wheels_truth(motion, gyro_bias_radps, sensors["imu"].time_s)
-    return streams, _labels(motion.record, scenario)
-
-
-def _substeps(robot: Robot, scenario: Scenario) -> int:
-    """Return the steps from twist to twist, once robot and scenario are checked."""
-    substeps = round(1 / (scenario.rate_hz * STEP_S))
-    if abs(substeps * scenario.rate_hz * STEP_S - 1.0) > 1e-9:
-        raise ConfigError(
-            f"scenario {scenario.name}: rate_hz is {scenario.rate_hz:g}, it must divide {1 / STEP_S:g}"
-        )
-    _, _, _, camera, sensors = robot.equipment
-    rates_hz = {"camera: rate_hz": camera.rate_hz} | {
-        f"sensors: {name}": getattr(sensors, name)
-        for name in ("wheels_rate_hz", "steering_rate_hz", "imu_rate_hz")
-    }
-    for name, rate_hz in rates_hz.items():
-        if rate_hz > 1 / STEP_S:
-            raise ConfigError(
-                f"robot {robot.name}: {name} is {rate_hz:g}, at most {1 / STEP_S:g} is simulated"
-            )
-    return substeps
-
-
-def _delay_steps(delay_s: float) -> int:
-    number = isinstance(delay_s, int | float | np.integer | np.floating) and not isinstance(delay_s, bool)
-    if not number or not 0 <= delay_s <= MAX_COMMAND_DELAY_S:
-        raise ConfigError(
-            f"command_delay_s is {delay_s!r}, a time from 0 to {MAX_COMMAND_DELAY_S:g} s is required"
-        )
-    return max(round(delay_s / STEP_S), 1)
-
-
-def _sensors(
-    motion: Motion, robot: Robot, faults: Faults, gnss: Gnss | None, rngs: Mapping[str, np.random.Generator]
-) -> tuple[dict[str, Sensor], Array]:
-    """Return the sensors on board, by stream, and the true bias of the yaw gyro."""
-    imu, gyro_bias_radps = imu_sensor(motion, robot, rngs["imu"])
+    rows = motion.record
+    imu, gyro_bias_radps = sensing.imu_sensor(motion, built, rngs["imu"])
     sensors = {
-        "wheels": wheel_sensor(motion, robot, rngs["wheels"]),
-        "steering": steering_sensor(motion, robot, rngs["steering"]),
+        "wheels": sensing.wheel_sensor(motion, built, rngs["wheels"]),
+        "steering": sensing.steering_sensor(motion, built, rngs["steering"]),
         "imu": imu,
-        "odometry": camera_sensor(motion, robot, rngs["camera"], faults),
+        "odometry": sensing.camera_sensor(motion, built, rngs["camera"], faults),
     }
     if gnss is not None:
-        sensors["gnss"] = gnss_sensor(motion, gnss, rngs["gnss"], faults)
+        sensors["gnss"] = sensing.gnss_sensor(motion, gnss, rngs["gnss"], faults)
     for name, sensor in sensors.items():
-        sensor.stamp(name, robot.effects)
-    return sensors, gyro_bias_radps
+        sensor.stamp(name, built.effects)
 
-
-def _built(robot: Robot, effects: Mapping[str, float]) -> Robot:
-    """Return the robot with all its effects, of which the commanded one lacks some."""
-    if not robot.effects and not effects:
-        return robot
-    acting = checked_effects("effects", {**robot.effects, **effects}, robot.drive)
-    n = len(acting)
-    extended = replace(robot, effects=acting, effects_cov=np.full((n, n), np.nan))
-    return apply_homes(extended, in_plant(Stage.DESCRIPTION))
-
-
-def _check_motion(rows: Array, robot: Robot) -> None:
+    status: list[Mapping[str, float]] = []
+    if controller is None:
+        wheels = wheel_motion(robot, scenario.twist, 1 / scenario.rate_hz)
+        decided = np.hstack([wheels.twist, wheels.wheel_radps, wheels.steer_rad])
+        held = np.repeat(decided, substeps, axis=0)
+        advance(plant, profile, state, held[:, 3:6].copy(), held[:, 6:].copy(), road_noise, rows)
+    else:
+        decided, delay_steps = np.empty((len(scenario.time_s), 9)), max(round(command_delay_s / STEP_S), 1)
+        wheel_radps, steer_rad = np.zeros((n_steps, 3)), np.zeros((n_steps, 3))  # in force at each step
+        done = 0
+        for k, time_s in enumerate(scenario.time_s.tolist()):
+            step = k * substeps
+            part, done = slice(done, step + 1), step + 1
+            advance(plant, profile, state, wheel_radps[part], steer_rad[part], road_noise[part], rows[part])
+            if not is_finite(state):
+                rows[done:] = filled(BODY_ROW, np.nan)
+                break
+            motion.grow(done)
+            for sensor in sensors.values():
+                sensor.update()
+            arrived = ((name, sensor.arrived(time_s)) for name, sensor in sensors.items())
+            readings = {name: reading for name, reading in arrived if reading is not None}
+            one, two, three = rows["wheels"]["patch_ratio"][step].tolist()
+            terrain = scenario.patches[int(one)].terrain if one == two == three else ""
+            command = controller(Sample(time_s, scenario.twist[k], readings, terrain))
+            decided[k], told = _checked(command, status[0] if status else None, time_s)
+            status.append(told)
+            in_force = slice(step + delay_steps, step + delay_steps + substeps)
+            wheel_radps[in_force], steer_rad[in_force] = decided[k, 3:6], decided[k, 6:]
+        else:
+            part = slice(done, n_steps)
+            advance(plant, profile, state, wheel_radps[part], steer_rad[part], road_noise[part], rows[part])
     later = ("wheels", "roll_rad", "pitch_rad")
     finite = all(np.isfinite(rows[name]).all() for name in BODY_ROW.names or () if name not in later)
-    fastest_radps = float(np.abs(rows["wheels"]["wheel_radps"]).max())
-    limit_radps = MAX_WHEEL_SPEEDS * robot.equipment.motors.speed_max_radps
-    if not finite or not fastest_radps <= limit_radps:
+    limit_radps = MAX_WHEEL_SPEEDS * robot.motors.speed_max_radps
+    if not finite or not np.abs(rows["wheels"]["wheel_radps"]).max() <= limit_radps:
         raise ConfigError(
             f"robot {robot.name}: its motion cannot be integrated in steps of {STEP_S:g} s; a mass, an "
             "inertia, a stiffness, a gain or the load is out of scale with the rest"
         )
 
-
-def _labels(rows: Array, scenario: Scenario) -> tuple[Label, ...]:
-    """One label a stretch in which all three wheels are on the same ground."""
-    patch = rows["wheels"]["patch_ratio"]
-    one = np.where((patch == patch[:, :1]).all(axis=1), patch[:, 0], -1)
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(one)) + 1, [len(one)]])
+    motion.grow(n_steps)
+    for sensor in sensors.values():
+        sensor.update()
+    streams = {name: sensor.stream() for name, sensor in sensors.items() if len(sensor.time_s) > 1}
+    streams["commands"] = Stream(scenario.time_s, decided, COMMAND_CHANNELS)
+    if status and status[0]:
+        table = np.array([[row[name] for name in status[0]] for row in status])
+        streams["control"] = Stream(scenario.time_s, table, tuple(status[0]))
+    streams["truth"] = dynamic_truth(motion, gyro_bias_radps, imu.time_s)
+    # one label a stretch in which all three wheels are on the same ground
     labels: list[Label] = []
-    for begin, end in pairwise(edges):
-        start_s, end_s = float(begin * STEP_S), float(end * STEP_S)
-        if one[begin] >= 0 and end_s - start_s >= MIN_LABEL_S:
-            terrain = scenario.patches[int(one[begin])].terrain
-            labels.append(Label(round(start_s, 3), round(end_s, 3), terrain))
-    return tuple(labels)
+    under = rows["wheels"]["patch_ratio"]
+    under = np.where((under == under[:, :1]).all(axis=1), under[:, 0], -1)
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(under)) + 1, [n_steps]])
+    for begin, end in pairwise(edges.tolist()):
+        start_s, end_s = begin * STEP_S, end * STEP_S
+        if under[begin] >= 0 and end_s - start_s >= MIN_LABEL_S:
+            labels.append(
+                Label(round(start_s, 3), round(end_s, 3), scenario.patches[int(under[begin])].terrain)
+            )
+    return streams, tuple(labels)
 
 
-class DrivenPlant:
-    """A plant that is driven on and on, by commands that come into force one after the other.
+_WHEEL_TRUTH = (
+    *("wheel_radps", "steer_rad", "slip_ratio", "slip_angle_rad", "normal_n", "traction_n", "torque_nm"),
+    *("sinkage_m", "side_n"),
+)
 
-    Parameters
-    ----------
-    plant, profile, state, road_noise, rows : as :func:`terrain.simulation.plants.dynamic.advance` takes them, for all
-        steps
+
+def dynamic_truth(motion: Motion, gyro_bias_radps: Array, gyro_time_s: Array) -> Stream:
+    """Return the truth of a motion at 100 Hz, a compromise with the size of files.
+
+    A slip that is never defined has no channel.
     """
-
-    def __init__(
-        self, plant: Array, profile: TerrainProfile, state: Array, road_noise: Array, rows: Array
-    ) -> None:
-        self._driven, self._state, self._noise, self._rows = (plant, profile, state), state, road_noise, rows
-        self._wheel, self._steer = np.zeros((1, 3)), np.zeros((1, 3))
-        self._due: deque[tuple[int, Array, Array]] = deque()
-        self._n_steps = 0
-
-    def command(self, step: int, wheel_radps: Array, steer_rad: Array) -> None:
-        """Let a command (3,), (3,) come into force with a step, not before those that were given before."""
-        self._due.append((step, wheel_radps, steer_rad))
-
-    def until(self, n_steps: int) -> bool:
-        """Drive until so many steps are done; false where the state is not finite: the rest of it is NaN."""
-        while self._n_steps < n_steps:
-            first = self._n_steps
-            if self._due and self._due[0][0] <= first:
-                _, self._wheel[0], self._steer[0] = self._due.popleft()
-                continue
-            end = min(n_steps, self._due[0][0]) if self._due else n_steps
-            held = (self._wheel, self._steer, end - first, self._noise[first:end], self._rows[first:end])
-            advance(*self._driven, *held)
-            self._n_steps = end
-        finite = is_finite(self._state)
-        if not finite:
-            self._rows[self._n_steps :] = filled(BODY_ROW, np.nan)[0]
-            self._n_steps = len(self._rows)
-        return finite
+    time_s, at = motion.at(sensing.TRUTH_HZ)
+    rows = motion.record[at]
+    of_wheels = {name: rows["wheels"][name] for name in _WHEEL_TRUTH}
+    bias = {sensing.GYRO_BIAS: np.interp(time_s, gyro_time_s, gyro_bias_radps)}
+    truth = sensing.truth_stream(time_s, rows, "123", of_wheels, bias)
+    known = np.asarray(np.isfinite(truth.values).any(axis=0))
+    channels = tuple(name for name, keep in zip(truth.channels, known, strict=True) if keep)
+    return Stream(time_s, truth.values[:, known], channels)
 
 
-def _in_loop(
-    controller: Callable[[Sample], Command],
-    delay_steps: int,
-    scenario: Scenario,
-    substeps: int,
-    drive: DrivenPlant,
-    motion: Motion,
-    sensors: Mapping[str, Sensor],
-) -> tuple[Array, dict[str, Array]]:
-    """Drive a scenario by a controller, to its last row; return commands (n, 9), and (n,) of their status by name."""
-    decided = np.empty((len(scenario.time_s), 9))
-    status: list[Mapping[str, float]] = []
-    for k, time_s in enumerate(scenario.time_s.tolist()):
-        step = k * substeps
-        if not drive.until(step + 1):
-            break
-        motion.grow(step + 1)
-        for sensor in sensors.values():
-            sensor.update()
-        arrived = ((name, sensor.arrived(time_s)) for name, sensor in sensors.items())
-        readings = {name: reading for name, reading in arrived if reading is not None}
-        one, two, three = motion.record["wheels"]["patch_ratio"][step].tolist()
-        terrain = scenario.patches[int(one)].terrain if one == two == three else ""
-        command = controller(Sample(time_s, scenario.twist[k], readings, terrain))
-        decided[k] = _numbers(command, time_s)
-        status.append(_status(command, status[0] if status else None, time_s))
-        drive.command(step + delay_steps, decided[k, 3:6], decided[k, 6:])
-    drive.until(len(motion.record))
-    names = status[0] if status else ()
-    return decided, {name: np.array([row[name] for row in status]) for name in names}
-
-
-def _numbers(command: Command, time_s: float) -> Array:
-    """Return twist, wheel rates and steering angles of a command in a row (9,)."""
-    row = np.empty(9)
+def _checked(
+    command: Command, first: Mapping[str, float] | None, time_s: float
+) -> tuple[Array, dict[str, float]]:
+    """Return twist, wheel rates and steering angles of a command in a row (9,), and its status as the first one's."""
+    row, where = np.empty(9), f"of its command at {time_s:g} s"
     for i, name in enumerate(("twist", "wheel_radps", "steer_rad")):
         given = getattr(command, name)
         try:
@@ -947,25 +801,17 @@ def _numbers(command: Command, time_s: float) -> Array:
             values = np.empty(0)
         if values.shape != (3,) or not np.isfinite(values).all():
             shown = " ".join(repr(given).split())
-            raise DataError(
-                f"controller: {name} of its command at {time_s:g} s is {shown}, 3 finite numbers are required"
-            )
+            raise DataError(f"controller: {name} {where} is {shown}, 3 finite numbers are required")
         row[3 * i : 3 * i + 3] = values
-    return row
-
-
-def _status(command: Command, first: Mapping[str, float] | None, time_s: float) -> dict[str, float]:
-    """Return the status of a command; ``first`` is that of the first one."""
     try:
         status = {name: float(value) for name, value in command.status.items()}
-        if first is None:
-            for name in status:
-                unit_of(name)
+        for name in status if first is None else ():
+            unit_of(name)
     except (AttributeError, TypeError, ValueError, LogError) as error:
-        raise DataError(f"controller: status of its command at {time_s:g} s: {error}") from None
+        raise DataError(f"controller: status {where}: {error}") from None
     if first is not None and status.keys() != first.keys():
         raise DataError(
-            f"controller: status of its command at {time_s:g} s has {', '.join(status) or 'nothing'}, "
+            f"controller: status {where} has {', '.join(status) or 'nothing'}, "
             f"that of the first has {', '.join(first) or 'nothing'}: the same names are required"
         )
-    return status
+    return row, status

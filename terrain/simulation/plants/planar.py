@@ -105,22 +105,26 @@ coloured and grows with speed.  Coloured noise is ``x_k = a x_(k-1) + sqrt(1 - a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import (
+    ACCEL,
     CHANNELS,
     CURRENT,
     EFFECTS,
+    GYRO,
     HEADING,
     INDEX,
     SLIDING_RADPS,
     SPEED_X,
+    SPEED_Y,
     TURNING_CURRENT,
     nuisances_of,
     vector_of,
@@ -130,29 +134,15 @@ from terrain.files.documents import number, read_yaml
 from terrain.files.names import data_folder
 from terrain.kernels import filled, inner, njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.kinematics.commands import WheelMotion, wheel_motion
+from terrain.kinematics.commands import wheel_motion
 from terrain.kinematics.wheels import point_velocity, rolling_matrix, velocity_matrix, wheel_frame_velocities
 from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS
 from terrain.records import Array, Label, Stream
-from terrain.robots import BicycleRobot, Part, Robot, SwerveRobot, TrackedRobot
+from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot
+from terrain.simulation import sensors as sensing
 from terrain.simulation.plants.dynamic import DEFLECTION_DAMPING_S, shear_slip
 from terrain.simulation.scenario import RATE_HZ, Conditions, Scenario
-from terrain.simulation.sensors import (
-    BODY,
-    GYRO_BIAS,
-    N_ERRORS,
-    RAW_HZ,
-    ImuErrors,
-    add_rate_noise,
-    camera_samples,
-    described_calibration,
-    encoder_angle,
-    generators,
-    imu_values,
-    raw_fixes,
-    truth_stream,
-    wheel_channels,
-)
+from terrain.simulation.sensors import BODY
 from terrain.slip import slip_angle, slip_ratio
 from terrain.terramechanics.soil import Soil
 from terrain.terramechanics.traction import equilibrium_slip, ground_record, wheel_ground
@@ -298,7 +288,13 @@ def body_numbers(robot: Robot, ground: Ground) -> Array:
     """
     complete = robot.completed
     motors, camera, body, sensors = complete.motors, complete.camera, complete.body, complete.sensors
-    n = len(robot.wheels)
+    n, thrust = len(robot.wheels), np.array(ground.thrust_ratio)
+    soft = np.full(N_SLIPS, ground.slip_ratio)  # slip over traction at even slips
+    if thrust.size >= 4:
+        slip, ratio = np.linspace(0.0, 1.0, thrust.size), np.empty(thrust.size)
+        ratio[1:] = slip[1:] / thrust[1:]
+        ratio[0] = 2.0 * ratio[1] - ratio[2]
+        soft = ratio if thrust.size == N_SLIPS else np.interp(_SLIPS, slip, ratio)
     return filled(
         PLANAR_BODY,
         n_wheels=n,
@@ -307,7 +303,7 @@ def body_numbers(robot: Robot, ground: Ground) -> Array:
         mass_kg=robot.mass_kg,
         rotating_kg=n * body.wheel_inertia_kgm2 / robot.wheel_radius_m**2,
         yaw_inertia_kgm2=body.yaw_inertia_kgm2,
-        nm_per_a=motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio,
+        nm_per_a=motors.nm_per_a,
         friction_nm=n * motors.friction_nm,
         lever_x_m=camera.lever_x_m,
         lever_y_m=camera.lever_y_m,
@@ -317,7 +313,7 @@ def body_numbers(robot: Robot, ground: Ground) -> Array:
         encoder_lag_s=sensors.encoder_time_constant_s,
         com_x_m=body.com_x_m,
         com_y_m=body.com_y_m,
-        soft_ratio=_slip_per_traction(ground),
+        soft_ratio=soft,
         grip_ratio=ground.grip_ratio,
         rolling_ratio=ground.rolling_ratio,
         scrub_ratio=ground.scrub_ratio if robot.skids else 0.0,
@@ -325,18 +321,6 @@ def body_numbers(robot: Robot, ground: Ground) -> Array:
         effective_ratio=ground.effective_ratio,
         seen_from_above=robot.on_omni_wheels,
     )
-
-
-def _slip_per_traction(ground: Ground) -> Array:
-    """Return slip over traction at slips (N_SLIPS,) evenly spaced from 0 to 1."""
-    thrust = np.array(ground.thrust_ratio)
-    if thrust.size < 4:
-        return np.full(N_SLIPS, ground.slip_ratio)
-    slip = np.linspace(0.0, 1.0, thrust.size)
-    ratio = np.empty(thrust.size)
-    ratio[1:] = slip[1:] / thrust[1:]
-    ratio[0] = 2.0 * ratio[1] - ratio[2]
-    return ratio if thrust.size == N_SLIPS else np.interp(_SLIPS, slip, ratio)
 
 
 @njit
@@ -372,41 +356,20 @@ def delayed(values: Array, late: float, rate: float) -> Array:
     """
     n = values.size
     out = np.empty(n)
-    first = last = n
-    if rate == 0.0:  # the same weights everywhere but at the ends
-        whole = math.floor(-late)
-        x = -late - whole
-        first, last = min(max(1 - whole, 0), n), max(min(n - 2 - whole, n), 0)
-        if first < last:
-            a, b = -x * (x - 1.0) * (x - 2.0) / 6.0, (x + 1.0) * (x - 1.0) * (x - 2.0) / 2.0
-            c, d = -(x + 1.0) * x * (x - 2.0) / 2.0, (x + 1.0) * x * (x - 1.0) / 6.0
-            i = first + whole
-            m = last - first
-            out[first:last] = a * values[i - 1 : i - 1 + m] + b * values[i : i + m]
-            out[first:last] += c * values[i + 1 : i + 1 + m] + d * values[i + 2 : i + 2 + m]
-        else:
-            first = last = n
     for k in range(n):
-        if k < first or k >= last:
-            out[k] = _between(values, k - late - rate * k)
+        at = min(max(k - late - rate * k, 0.0), n - 1.0)
+        i = min(int(at), n - 2)
+        x = at - i
+        if 1 <= i < n - 2:
+            out[k] = (
+                -x * (x - 1.0) * (x - 2.0) / 6.0 * values[i - 1]
+                + (x + 1.0) * (x - 1.0) * (x - 2.0) / 2.0 * values[i]
+                - (x + 1.0) * x * (x - 2.0) / 2.0 * values[i + 1]
+                + (x + 1.0) * x * (x - 1.0) / 6.0 * values[i + 2]
+            )
+        else:
+            out[k] = values[i] + x * (values[i + 1] - values[i])
     return out
-
-
-@inner
-def _between(values: Array, at: float) -> float:
-    """Return a signal between its samples; its ends are held."""
-    n = values.size
-    at = min(max(at, 0.0), n - 1.0)
-    i = min(int(at), n - 2)
-    x = at - i
-    if 1 <= i < n - 2:
-        return float(
-            -x * (x - 1.0) * (x - 2.0) / 6.0 * values[i - 1]
-            + (x + 1.0) * (x - 1.0) * (x - 2.0) / 2.0 * values[i]
-            - (x + 1.0) * x * (x - 2.0) / 2.0 * values[i + 1]
-            + (x + 1.0) * x * (x - 1.0) / 6.0 * values[i + 2]
-        )
-    return float(values[i] + x * (values[i + 1] - values[i]))
 
 
 @njit
@@ -497,15 +460,6 @@ def direction(speed_mps: float) -> float:
 
 
 @inner
-def _remaining(before_s: float, after_s: float, dt: float) -> float:
-    """Return what a step leaves of an offset where the time constant runs straight: ``v' = -v / tau``."""
-    change = math.log(after_s / before_s)
-    if abs(change) < 1e-3:
-        return math.exp(-2.0 * dt / (before_s + after_s))
-    return math.exp(-dt * change / (after_s - before_s))
-
-
-@inner
 def slip_along(
     body: Any, p: Any, dt: float, u: Array, scrub_n: Array, grade_rad: Array, disturbance: Array, fast: bool
 ) -> tuple[Array, Array, Array]:
@@ -536,7 +490,14 @@ def slip_along(
         if fast and min(tau, tau_before) > SHORTEST_S and grows > FALLS_MOST:
             slope = (target - target_before) / (dt * (1.0 + grows))
             off = speed[k - 1] - target_before + tau_before * slope
-            speed[k] = target - tau * slope + _remaining(tau_before, tau, dt) * off
+            change = math.log(
+                tau / tau_before
+            )  # what a step leaves of an offset, v' = -v / tau, as tau runs straight
+            if abs(change) < 1e-3:
+                remaining = math.exp(-2.0 * dt / (tau_before + tau))
+            else:
+                remaining = math.exp(-dt * change / (tau - tau_before))
+            speed[k] = target - tau * slope + remaining * off
         elif k > 0 and tau > SHORTEST_S:
             lead = tau * (target - target_before) / dt
             speed[k] = target - lead + math.exp(-dt / tau) * (speed[k - 1] - target_before + lead)
@@ -557,10 +518,32 @@ def _move_skid(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array
     out = np.zeros(n, TRUTH)
     mass = body.mass_kg * (1.0 + p.payload_ratio)
     scrub = (body.scrub_ratio + p.scrub_ratio) * (body.mass_kg * GRAVITY_MPS2)
-    radius_m = body.radius_m * (1.0 + p.wheel_radius_ratio)
-    u, turn, tight, difference = _differed(params[0], p, dt, wheel_speed_mps)
-    scrub_n = np.empty(n)
+    scale = 1.0 + p.wheel_radius_ratio
+    radius_m = body.radius_m * scale
+    right, left = 1.0 + 0.5 * p.one_sided_radius_ratio, 1.0 - 0.5 * p.one_sided_radius_ratio
+    # speed without slip, yaw rate, how tight the turn is, difference of the sides
+    u, turn, tight, difference, scrub_n = np.empty(n), np.empty(n), np.zeros(n), np.empty(n), np.empty(n)
     for k in range(n):
+        v_l, v_r = wheel_speed_mps[k, 0] * scale * left, wheel_speed_mps[k, 1] * scale * right
+        dv = v_r - v_l
+        u[k] = 0.5 * (v_r + v_l)
+        size = abs(dv) + 2.0 * abs(u[k])
+        tight[k] = abs(dv) / size if size > 1e-6 else 0.0
+        lost = p.turning_slip_ratio * tight[k] * dv
+        if lost != 0.0:
+            share = 1.0 - ENDO_POWER - (p.turning_slip_power_ratio if params[0].tracked else 0.0)
+            a, b = abs(v_r) ** share, abs(v_l) ** share
+            u[k] -= 0.5 * lost * (a - b) / (a + b)
+        difference[k] = dv
+        turn[k] = (dv - lost) / (body.track_m * (1.0 + p.effective_track_ratio))
+        if p.track_narrowing_s2pm2 != 0.0:
+            x = p.track_narrowing_s2pm2 * (u[k] * turn[k]) ** 2 / (1.0 + (turn[k] / SLIDING_RADPS) ** 2)
+            turn[k] *= 1.0 + x / (1.0 + abs(x))
+    if p.yaw_delay_s != 0.0:
+        turn = delayed(turn, p.yaw_delay_s / dt, 0.0)
+    for k in range(n):
+        drag = p.turn_drag_s2 * turn[k] * turn[k]
+        u[k] *= 1.0 / (1.0 + drag) if drag > 0.0 else 1.0 - drag  # never turns the motion about
         scrub_n[k] = scrub * tight[k] * direction(u[k])
     speed, rest, slip = slip_along(body, p, dt, u, scrub_n, grade_rad, disturbance, False)
     out["speed_x_mps"][:], out["yaw_rate_radps"][:], out["slip_ratio"][:] = speed, turn, slip
@@ -578,53 +561,16 @@ def _move_skid(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array
     return out
 
 
-@inner
-def _differed(sides: Any, p: Any, dt: float, wheel_speed_mps: Array) -> tuple[Array, Array, Array, Array]:
-    """Return speed without slip, yaw rate, how tight the turn is and the difference of the sides (n,)."""
-    n = wheel_speed_mps.shape[0]
-    u, turn, tight, difference = np.empty(n), np.empty(n), np.zeros(n), np.empty(n)
-    scale = 1.0 + p.wheel_radius_ratio
-    right, left = 1.0 + 0.5 * p.one_sided_radius_ratio, 1.0 - 0.5 * p.one_sided_radius_ratio
-    for k in range(n):
-        v_l, v_r = wheel_speed_mps[k, 0] * scale * left, wheel_speed_mps[k, 1] * scale * right
-        dv = v_r - v_l
-        u[k] = 0.5 * (v_r + v_l)
-        size = abs(dv) + 2.0 * abs(u[k])
-        tight[k] = abs(dv) / size if size > 1e-6 else 0.0
-        lost = p.turning_slip_ratio * tight[k] * dv
-        if lost != 0.0:
-            share = 1.0 - ENDO_POWER - (p.turning_slip_power_ratio if sides.tracked else 0.0)
-            a, b = abs(v_r) ** share, abs(v_l) ** share
-            u[k] -= 0.5 * lost * (a - b) / (a + b)
-        difference[k] = dv
-        turn[k] = (dv - lost) / (sides.body.track_m * (1.0 + p.effective_track_ratio))
-        if p.track_narrowing_s2pm2 != 0.0:
-            x = p.track_narrowing_s2pm2 * (u[k] * turn[k]) ** 2 / (1.0 + (turn[k] / SLIDING_RADPS) ** 2)
-            turn[k] *= 1.0 + x / (1.0 + abs(x))
-    if p.yaw_delay_s != 0.0:
-        turn = delayed(turn, p.yaw_delay_s / dt, 0.0)
-    if p.turn_drag_s2 != 0.0:
-        for k in range(n):
-            drag = p.turn_drag_s2 * turn[k] * turn[k]
-            u[k] *= 1.0 / (1.0 + drag) if drag > 0.0 else 1.0 - drag  # never turns the motion about
-    return u, turn, tight, difference
-
-
 SKID = PlanarDrive(SIDES, lambda robot, ground: {"tracked": isinstance(robot, TrackedRobot)}, _move_skid)
 
 
 SLOW_MPS = 0.01  # speed below which tyres damp a sideways motion as at it: in less than a millisecond
-LEAST_RATIO = (
-    0.1  # the effective wheelbase over the wheelbase at the least, and what is left of an axle's compliance
-)
+# The effective wheelbase over the wheelbase at the least, and what is left of an axle's compliance.
+LEAST_RATIO = 0.1
 STEEPEST_RAD = 1.3  # steering angle at the most, where its tangent is 3.6
 
 _AXLES = "wheelbase_m com_ahead_m front_cornering_npr rear_cornering_npr yaw_inertia_kgm2"
 AXLES = record({"body": PLANAR_BODY} | numbers(_AXLES))
-
-
-def _bicycle_numbers(robot: Robot, ground: Ground) -> dict[str, Any]:
-    return {name: getattr(robot, name) for name in _AXLES.split()}
 
 
 @njit
@@ -641,15 +587,8 @@ def _move_bicycle(params: Array, vector: Array, dt: float, inputs: Inputs) -> Ar
         out[k].force_n = mass * accel[k] + rest[k]
         out[k].speed_x_mps, out[k].slip_ratio = speed[k], slip[k]
     angle = steer_rad[:, 0] + p.steering_offset_front_rad
-    _turn(params[0], p, dt, steered(angle, p.steering_delay_s, p.steering_backlash_rad, dt), roll_rad, out)
-    return out
-
-
-@inner
-def _turn(car: Any, p: Any, dt: float, steer: Array, roll_rad: Array, out: Array) -> None:
-    """Fill in yaw rate and lateral speed of the rear axle of a body that drives at its ``speed_x_mps``."""
-    nominal = car.body.mass_kg
-    mass = nominal * (1.0 + p.payload_ratio)
+    steer = steered(angle, p.steering_delay_s, p.steering_backlash_rad, dt)
+    car, nominal = params[0], body.mass_kg
     inertia = car.yaw_inertia_kgm2 * (1.0 + p.payload_ratio)
     wheelbase, a = car.wheelbase_m, car.com_ahead_m
     b = wheelbase - a
@@ -657,7 +596,7 @@ def _turn(car: Any, p: Any, dt: float, steer: Array, roll_rad: Array, out: Array
     front = soft / car.front_cornering_npr  # compliance of the axles
     rear = soft / car.rear_cornering_npr
     front = max(front + p.understeer_s2pm * wheelbase / (nominal * a), LEAST_RATIO * front)
-    gravity = GRAVITY_MPS2 * car.body.effective_ratio
+    gravity = GRAVITY_MPS2 * body.effective_ratio
     c = w = c_before = w_before = 0.0  # of the body, and the steady ones of the sample before
     for k in range(out.shape[0]):
         v = out[k].speed_x_mps
@@ -689,6 +628,7 @@ def _turn(car: Any, p: Any, dt: float, steer: Array, roll_rad: Array, out: Array
             w = w_now + w_lag + one * w_off + by_a * (wc * c_off + ww * w_off)
         c_before, w_before = c_now, w_now
         out[k].speed_y_mps, out[k].yaw_rate_radps = c - a * w, w
+    return out
 
 
 @inner
@@ -702,7 +642,9 @@ def _front(mass: float, wheelbase: float, a: float, front: float, rear: float, v
     return front
 
 
-BICYCLE = PlanarDrive(AXLES, _bicycle_numbers, _move_bicycle)
+BICYCLE = PlanarDrive(
+    AXLES, lambda robot, ground: {name: getattr(robot, name) for name in _AXLES.split()}, _move_bicycle
+)
 
 
 # Speed below which slip is no more over the speed itself, and over which a resistance takes its full size; assumed:
@@ -710,9 +652,8 @@ BICYCLE = PlanarDrive(AXLES, _bicycle_numbers, _move_bicycle)
 ROLLING_MPS = 0.02
 # Slip per traction that an effect leaves of the ground's own at the least, and that of the stiffest.
 STIFFEST, STIFFEST_GROUND = 0.1, 1e-6
-SUBSTEPS = (
-    4  # implicit steps within one of the simulation, so that their lag, half of each, is about a millisecond
-)
+# Implicit steps within one of the simulation, so that their lag, half of each, is about a millisecond.
+SUBSTEPS = 4
 
 ROLLERS = record(
     {"body": PLANAR_BODY, "wheel_load_ratio": (float, 3), **numbers("wheel_distance_m roller_ratio")}
@@ -796,8 +737,18 @@ def _move_omni(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array
         if disturbance.shape[0] > 0:
             out[k].speed_x_mps *= 1.0 - disturbance[k, 0]
             out[k].speed_y_mps *= 1.0 - disturbance[k, 0]
-        u = wheel_speed_mps[k] * (1.0 + p.wheel_radius_ratio)
-        out[k].slip_ratio = _body_slip(rollers, u, out[k].speed_x_mps, out[k].speed_y_mps)
+        x, y = (
+            0.0,
+            0.0,
+        )  # what the wheels roll, along which the body slips; 0 where neither moves, and in place
+        for i in range(body.n_wheels):
+            u_i = wheel_speed_mps[k, i] * (1.0 + p.wheel_radius_ratio)
+            x += rollers.to_rolled[0, i] * u_i
+            y += rollers.to_rolled[1, i] * u_i
+        rolled = math.sqrt(x * x + y * y)
+        if rolled >= ROLLING_MPS:
+            ahead = (out[k].speed_x_mps * x + out[k].speed_y_mps * y) / rolled
+            out[k].slip_ratio = (rolled - ahead) / max(rolled, abs(ahead))
     return out
 
 
@@ -896,20 +847,6 @@ def _solve(matrix: Array, pushed: Array, out: Array) -> None:
     out[0] = (p0 * x + p1 * y + p2 * z) * by
     out[1] = (p1 * x + q1 * y + q2 * z) * by
     out[2] = (p2 * x + q2 * y + r2 * z) * by
-
-
-@inner
-def _body_slip(rollers: Any, wheel_speed_mps: Array, v_x: float, v_y: float) -> float:
-    """Return the slip of the body along what the wheels roll; 0 where neither moves, and in place."""
-    x, y = 0.0, 0.0
-    for i in range(rollers.body.n_wheels):
-        x += rollers.to_rolled[0, i] * wheel_speed_mps[i]
-        y += rollers.to_rolled[1, i] * wheel_speed_mps[i]
-    rolled = math.sqrt(x * x + y * y)
-    if rolled < ROLLING_MPS:
-        return 0.0
-    along = (v_x * x + v_y * y) / rolled
-    return (rolled - along) / max(rolled, abs(along))
 
 
 def steady_twist(
@@ -1282,140 +1219,66 @@ def _sense(params: Array, vector: Array, dt: float, truth: Array) -> Array:
 WHEELS_HZ, IMU_HZ, CAMERA_HZ = 50.0, 100.0, 50.0  # rates of the loggers
 
 
-class Scatter(NamedTuple):
-    """Standard deviations of what differs from run to run by itself."""
-
-    gyro_bias_radps: float
-    accel_bias_mps2: float
-    pitch_offset_rad: float
-    roll_offset_rad: float
-    wheel_radius_ratio: float
-    one_sided_radius_ratio: float
-    rolling_resistance_ratio: float
-    force_slip_ratio: float
-    effective_track_ratio: float
-
-
-class Noise(NamedTuple):
-    """Noise of a run: standard deviations, and ``*_s`` the time over which it forgets itself.
-
-    All but white noise is that of a robot fast enough; at the speed ``moving_mps`` it has half its size, and at rest
-    none.
-    """
-
-    along_ratio: float
-    along_s: float
-    across_ratio: float
-    across_s: float
-    yaw_radps: float
-    yaw_s: float
-    gyro_radps: float
-    gyro_s: float
-    accel_mps2: float
-    accel_s: float
-    current_skid_a: float
-    current_swerve_a: float
-    current_s: float
-    camera_mps: float
-    camera_s: float
-    encoder_m: float
-    tilt_rad: float
-    heading_rad: float
-    moving_mps: float
-
-    def current_a(self, robot: Robot) -> float:
-        """Return the noise of the sum of a robot's currents; that of an omni robot is in its description."""
-        if robot.on_omni_wheels:
-            return 0.0
-        return self.current_skid_a if robot.skids else self.current_swerve_a
-
-
-def load_scatter() -> Scatter:
-    """Return the scatter that travels with the package."""
-    return Scatter(**_spread_numbers("scatter", Scatter._fields))
-
-
-def load_noise() -> Noise:
-    """Return the noise that travels with the package.
-
-    Examples
-    --------
-    >>> load_noise().along_s
-    0.3
-    """
-    return Noise(**_spread_numbers("noise", Noise._fields))
-
-
-class ModelError(NamedTuple):
-    """How far the planar simulation on a soil of the package is off the dynamic plant, by parameter."""
-
-    common: dict[str, float]  # value that each parameter seems to have where nothing is hidden
-    varied: dict[str, float]  # the same of the mean over runs whose conditions differ
-    scatter: dict[str, float]  # of single runs whose conditions differ
-    probes: dict[tuple[str, str], float]  # what the residual depends on, by channel and input
-
-
-def load_model_error() -> ModelError:
-    """Return the simulation's own error; ``data/spread/planar.yaml`` says how it was measured."""
-    common, varied, scatter = (
-        _spread_numbers(part, tuple(_described()[part]))
-        for part in ("model_error", "varied_error", "varied_scatter")
-    )
-    probes = {
-        (channel, name): float(size)
-        for channel, entry in _described()["probe_error"].items()
-        for name, size in entry["sizes"].items()
-    }
-    return ModelError(common, varied, scatter, probes)
-
-
 @cache
-def _described() -> Any:
+def _spread() -> Any:
     return read_yaml(data_folder("spread") / "planar.yaml")
 
 
-def _spread_numbers(part: str, names: tuple[str, ...]) -> dict[str, float]:
-    described = _described()[part]
-    return {
-        name: number(f"planar.yaml: {part}: {name}", described[name], name.rpartition("_")[2], 0.0)
-        for name in names
-    }
+def spread_numbers(part: str) -> dict[str, float]:
+    """Return a part of ``data/spread/planar.yaml``, which travels with the package and has all sources.
 
-
-@njit
-def coloured(white: Array, std: Array, tau_s: Array, dt: float) -> Array:
-    """Return noise (c, n) of sizes and memories (c,) from white noise (c, n) of size 1, sampled every ``dt`` s."""
-    out = np.empty_like(white)
-    for i in range(white.shape[0]):
-        keep = math.exp(-dt / tau_s[i])
-        push = math.sqrt(1.0 - keep * keep) * std[i]
-        value = std[i] * white[i, 0]
-        out[i, 0] = value
-        for k in range(1, white.shape[1]):
-            value = keep * value + push * white[i, k]
-            out[i, k] = value
-    return out
-
-
-@njit
-def lag_weights(time_constant_s: float, dt: float) -> tuple[float, float, float]:
-    """Return weights of this sample, the one before and the last output in an exact first-order low-pass.
+    Parameters
+    ----------
+    part : ``scatter``, standard deviations of what differs from run to run by itself; ``noise`` of a run, and ``*_s``
+        the time over which it forgets itself: all but white noise is that of a robot fast enough, at the speed
+        ``moving_mps`` it has half its size, and at rest none; ``model_error``, the value that each parameter seems to
+        have where nothing is hidden on a soil of the package, ``varied_error`` and ``varied_scatter`` the same of the
+        mean and of single runs whose conditions differ
 
     Examples
     --------
-    >>> [round(float(weight), 4) for weight in lag_weights(0.05, 0.02)]
-    [0.1758, 0.1539, 0.6703]
+    >>> spread_numbers("noise")["along_s"]
+    0.3
     """
-    keep = math.exp(-dt / time_constant_s)
-    slope = time_constant_s / dt * (1.0 - keep)
-    return 1.0 - slope, slope - keep, keep
+    return {
+        name: number(f"planar.yaml: {part}: {name}", entry, name.rpartition("_")[2], 0.0)
+        for name, entry in _spread()[part].items()
+    }
 
 
-def activity(speed_mps: Any, noise: Noise) -> Any:
+def probe_error() -> dict[tuple[str, str], float]:
+    """Return what the residual of the simulation on a soil of the package depends on, by channel and input."""
+    return {
+        (channel, name): float(size)
+        for channel, entry in _spread()["probe_error"].items()
+        for name, size in entry["sizes"].items()
+    }
+
+
+def current_noise_a(noise: Mapping[str, float], robot: Robot) -> float:
+    """Return the noise of the sum of a robot's currents; that of an omni robot is in its description."""
+    if robot.on_omni_wheels:
+        return 0.0
+    return noise["current_skid_a"] if robot.skids else noise["current_swerve_a"]
+
+
+def coloured(white: Array, std: Sequence[float] | Array, tau_s: Sequence[float] | Array, dt: float) -> Array:
+    """Return noise (n, c) of sizes and memories (c,) from white noise (c, n) of size 1, sampled every ``dt`` s."""
+    out = np.empty(white.shape[::-1])
+    for i, row in enumerate(white):
+        keep = math.exp(-dt / tau_s[i])
+        push = math.sqrt(1.0 - keep * keep) * std[i] * row
+        push[0] = std[i] * row[0]
+        out[:, i] = lfilter([1.0], [1.0, -keep], push)
+    return out
+
+
+def activity(speed_mps: Any, noise: Mapping[str, float]) -> Any:
     """Return how much of the noise of a moving robot there is at a speed of its wheels, 0 to 1."""
-    return np.abs(speed_mps) / (np.abs(speed_mps) + noise.moving_mps)
+    return np.abs(speed_mps) / (np.abs(speed_mps) + noise["moving_mps"])
 
 
+WHEELS_HZ, IMU_HZ, CAMERA_HZ = 50.0, 100.0, 50.0  # rates of the loggers
 # Each of the two lags in a row by which a wheel follows its command, and that of the steering; assumed.
 DRIVE_S, STEER_S = 0.06, 0.08
 DRIVE_MPS2 = 4.0  # the most that a wheel speeds up; assumed, 2 g of grip would be needed for more
@@ -1432,73 +1295,6 @@ BODY_SLIP = "slip_body_ratio"
 _PURPOSES = ("scatter", "hills", "ground", "wheels", "steering", "imu", "camera", "outside", "lidar")
 
 
-class _DrivenRun:
-    """A drive before its loggers.
-
-    ``p`` are the effects by name, ``truth`` and ``pose`` the motion at each step of ``dt``, ``wheel_speed_mps`` and
-    ``steer_rad`` as encoders without error show them, ``true_speed_mps`` circumferential speeds with the true radii,
-    ``active`` the factor on the noise of a moving robot, and ``ideal`` the channels of sensors without noise.
-    """
-
-    def __init__(
-        self,
-        planar: Planar,
-        vector: Array,
-        dt: float,
-        noise: Noise | None,
-        rngs: Mapping[str, np.random.Generator],
-    ) -> None:
-        self.robot, self.planar, self.vector, self.p = planar.robot, planar, vector, vector.view(EFFECTS)[0]
-        self.dt, self.noise, self.rngs = dt, noise, rngs
-
-    def follow(self, desired: WheelMotion, conditions: Conditions, eccentric: float) -> None:
-        """Let the robot follow commands over hills."""
-        robot, p, dt, noise, rngs = self.robot, self.p, self.dt, self.noise, self.rngs
-        parts, fastest = round(1.0 / (RATE_HZ * dt)), robot.steering_rate_max_radps
-        speed, steer = follow_commands(desired.wheel_speed_mps, desired.steer_rad, parts, dt, fastest)
-        n, wheels = speed.shape
-        active, disturbance = np.zeros(n), np.zeros((0, 3))
-        if noise is not None:
-            active = activity(np.abs(speed).mean(axis=1), noise)
-            std = np.array([noise.along_ratio, noise.across_ratio, noise.yaw_radps])
-            tau_s = np.array([noise.along_s, noise.across_s, noise.yaw_s])
-            disturbance = coloured(rngs["ground"].standard_normal((3, n)), std, tau_s, dt).T.copy()
-            disturbance[:, 2] *= active
-        turned = speed
-        if eccentric:
-            phase = rngs["outside"].uniform(0.0, 2.0 * math.pi, wheels)
-            angle = np.cumsum(speed, axis=0) * dt / robot.wheel_radius_m
-            turned = speed * (1.0 + eccentric * np.sin(angle + phase))
-        grade = roll = np.zeros(n)
-        truth = move(self.planar, self.vector, dt, turned, steer, grade, roll, disturbance)
-        pose, slope = _path(truth, dt), np.array(conditions.grade_ratio)
-        grade, roll = _tilt_along(pose, slope, _undulations(conditions, rngs["hills"]))
-        if grade.any() or roll.any():
-            truth = move(self.planar, self.vector, dt, turned, steer, grade, roll, disturbance)
-            pose = _path(truth, dt)
-        sides = np.full(wheels, 1.0 - 0.5 * p["one_sided_radius_ratio"])
-        sides[-1] = 1.0 + 0.5 * p["one_sided_radius_ratio"]
-        self.true_speed_mps = turned * (1.0 + p["wheel_radius_ratio"]) * sides * _encoder_scales(robot, p)
-        self.truth, self.pose, self.grade_rad, self.roll_rad = truth, pose, grade, roll
-        self.wheel_speed_mps, self.steer_rad, self.active = speed, steer, active
-        self.ideal = sense(self.planar, self.vector, dt, truth)
-
-    def samples(self, rate_hz: float) -> tuple[Array, Array]:
-        """Return steps and stamps (k,) of a logger."""
-        rows = np.arange(0, len(self.ideal), round(1.0 / (rate_hz * self.dt)))
-        return rows, np.arange(len(rows)) / rate_hz
-
-    def channel(self, name: str) -> Array:
-        """Return one channel (n,) of sensors without noise."""
-        return self.ideal[:, CHANNELS.index(name)]
-
-    def delayed(self, values: Array, latency_s: float) -> Array:
-        """Return a signal (n,) as the logger of IMU and camera stamps it, behind a latency."""
-        late = (self.p["clock_offset_s"] + latency_s) / self.dt
-        rate = self.p["clock_rate_ratio"]
-        return np.asarray(delayed(values, late, rate)) if late != 0.0 or rate != 0.0 else values
-
-
 def run_planar(
     robot: Robot,
     drive: Scenario | Array,
@@ -1507,8 +1303,8 @@ def run_planar(
     *,
     conditions: Conditions,
     effects: Mapping[str, float],
-    scatter: Scatter | None = None,
-    noise: Noise | None = None,
+    scatter: Mapping[str, float] | None = None,
+    noise: Mapping[str, float] | None = None,
     outside: Mapping[str, float] | None = None,
     heading: bool = False,
     fixes: bool = False,
@@ -1523,52 +1319,17 @@ def run_planar(
     conditions : load, and the lie of the land along the start's heading and to its left; of undulations, the
         standard deviation of what three waves that cross in drawn directions add to either
     effects : parameters of :mod:`terrain.effects`, beside or in place of the description's own
-    scatter : of this run's own parameters; by default they do not
-    noise : none by default; then encoders do not quantise
+    scatter : of this run's own parameters, by name as :func:`spread_numbers` has it; by default they do not
+    noise : by name, none by default; then encoders do not quantise
     outside : amplitudes of :data:`OUTSIDE`
     heading : add the stream lidar, with the rate of a heading that does not depend on the gyro
     fixes : add the streams gnss and compass
     terrain : label of a drive that is no scenario; without one it has none
     step_s : from step to step
     """
-    outside = outside or {}
+    outside, dt = outside or {}, step_s
     twist = drive.twist if isinstance(drive, Scenario) else np.asarray(drive)
     terrain = drive.patches[0].terrain if isinstance(drive, Scenario) else terrain
-    _check(robot, twist, outside, step_s)
-    logs_currents = robot.describes("motors") and "motors" in robot.sections
-    robot = with_silent_parts(robot)
-    rngs = generators(seed, _PURPOSES)
-    vector = vector_of({**robot.effects, **effects})
-    vector[INDEX["payload_ratio"]] += conditions.payload_kg / robot.mass_kg
-    if scatter is not None:
-        for name in nuisances_of(robot.drive):
-            vector[INDEX[name]] += getattr(scatter, name) * rngs["scatter"].standard_normal()
-    desired = wheel_motion(robot, twist, 1.0 / RATE_HZ)
-    run = _DrivenRun(make_planar(robot, ground), vector, step_s, noise, rngs)
-    run.follow(desired, conditions, outside.get("wheel_eccentricity_ratio", 0.0))
-    rows = [*("speed_x_mps", "speed_y_mps", "yaw_rate_radps"), *wheel_channels("wheel_radps", robot.wheels)]
-    commands = [desired.twist, desired.wheel_radps, desired.steer_rad[:, : len(robot.steer_rows)]]
-    streams = {"wheels": _wheels(run, outside.get("stick_slip_a", 0.0), logs_currents)}
-    if robot.on_omni_wheels:
-        streams["pose"] = _pose(run)
-    else:
-        streams |= {"imu": _imu(run), "odometry": _camera(run)}
-    streams["commands"] = Stream(
-        np.arange(len(twist)) / RATE_HZ, np.hstack(commands), (*rows, *robot.steer_rows)
-    )
-    time_s, body = _body(run)
-    streams["truth"] = _truth(run, time_s, body)
-    if robot.steered:
-        streams["steering"] = _steering(run)
-    if heading:
-        streams["lidar"] = _lidar(run)
-    if fixes:
-        at_s, every = np.arange(0.0, time_s[-1] + 1e-9, 1.0 / RAW_HZ), round(IMU_HZ / RAW_HZ)
-        streams |= raw_fixes(at_s, body[::every], generators(seed, ("fixes",))["fixes"])
-    return streams, (Label(0.0, (len(twist) - 1) / RATE_HZ, terrain),) if terrain else ()
-
-
-def _check(robot: Robot, twist: Array, outside: Mapping[str, float], step_s: float) -> None:
     if isinstance(robot, SwerveRobot):
         robot.require(*robot.sections)
     if twist.ndim != 2 or twist.shape[1] != 3 or len(twist) < 2 or not np.isfinite(twist).all():
@@ -1584,9 +1345,250 @@ def _check(robot: Robot, twist: Array, outside: Mapping[str, float], step_s: flo
             raise ConfigError(
                 f"outside: {name} is {value!r}; finite numbers of {', '.join(OUTSIDE)} are required"
             )
-    parts = STEP_S / step_s if step_s > 0 else 0.0
+    parts = STEP_S / dt if dt > 0 else 0.0
     if parts < 0.5 or abs(parts - round(parts)) > 1e-9:
-        raise ConfigError(f"step_s is {step_s:g}, {STEP_S:g} s or a whole part of it is required")
+        raise ConfigError(f"step_s is {dt:g}, {STEP_S:g} s or a whole part of it is required")
+    logs_currents = robot.describes("motors") and "motors" in robot.sections
+    robot, rngs = with_silent_parts(robot), sensing.generators(seed, _PURPOSES)
+    camera, sensors, motors, wheels = robot.camera, robot.sensors, robot.motors, len(robot.wheels)
+    vector = vector_of({**robot.effects, **effects})
+    vector[INDEX["payload_ratio"]] += conditions.payload_kg / robot.mass_kg
+    if scatter is not None:
+        for name in nuisances_of(robot.drive):
+            vector[INDEX[name]] += scatter[name] * rngs["scatter"].standard_normal()
+    p, planar = vector.view(EFFECTS)[0], make_planar(robot, ground)
+
+    # the wheels follow their commands, and the body its wheels
+    desired = wheel_motion(robot, twist, 1.0 / RATE_HZ)
+    speed, steer = follow_commands(
+        desired.wheel_speed_mps,
+        desired.steer_rad,
+        round(1.0 / (RATE_HZ * dt)),
+        dt,
+        robot.steering_rate_max_radps,
+    )
+    n = len(speed)
+    active, disturbance, turned = np.zeros(n), np.zeros((0, 3)), speed
+    if noise is not None:
+        active = activity(np.abs(speed).mean(axis=1), noise)
+        std, tau_s = (
+            [noise[f"{part}_{unit}"] for part, unit in zip(("along", "across", "yaw"), units, strict=True)]
+            for units in (("ratio", "ratio", "radps"), "sss")
+        )
+        disturbance = coloured(rngs["ground"].standard_normal((3, n)), std, tau_s, dt)
+        disturbance[:, 2] *= active
+    if eccentric := outside.get("wheel_eccentricity_ratio", 0.0):
+        phase = rngs["outside"].uniform(0.0, 2.0 * math.pi, wheels)
+        angle = np.cumsum(speed, axis=0) * dt / robot.wheel_radius_m
+        turned = speed * (1.0 + eccentric * np.sin(angle + phase))
+    grade = roll = np.zeros(n)
+    truth = move(planar, vector, dt, turned, steer, grade, roll, disturbance)
+    pose = _path(truth, dt)
+    grade, roll = _tilt_along(pose, conditions, rngs["hills"])
+    if grade.any() or roll.any():
+        truth = move(planar, vector, dt, turned, steer, grade, roll, disturbance)
+        pose = _path(truth, dt)
+    sides = np.full(wheels, 1.0 - 0.5 * p["one_sided_radius_ratio"])
+    sides[-1] = 1.0 + 0.5 * p["one_sided_radius_ratio"]
+    scales = [f"wheel_scale_{wheel}_ratio" for wheel in robot.wheels]
+    counts = np.array([1.0 + p[name] if name in INDEX else 1.0 for name in scales])  # encoders may lose some
+    true_speed = turned * (1.0 + p["wheel_radius_ratio"]) * sides * counts
+    ideal = dict(zip(CHANNELS, sense(planar, vector, dt, truth).T, strict=True))
+    v_x, v_y, turn = (truth[name] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"))
+
+    def samples(rate_hz: float) -> tuple[Array, Array]:
+        """Return steps and stamps (k,) of a logger."""
+        rows = np.arange(0, n, round(1.0 / (rate_hz * dt)))
+        return rows, np.arange(len(rows)) / rate_hz
+
+    def late(values: Array, latency_s: float) -> Array:
+        """Return a signal (n,) as the logger of IMU and camera stamps it, behind a latency."""
+        steps, rate = (p["clock_offset_s"] + latency_s) / dt, p["clock_rate_ratio"]
+        return np.asarray(delayed(values, steps, rate)) if steps != 0.0 or rate != 0.0 else values
+
+    # wheels: encoders count distance over a period, stamped in its middle; currents
+    rows, time_s = samples(WHEELS_HZ)
+    k, every, rng, wheels_s = len(rows), round(1.0 / (WHEELS_HZ * dt)), rngs["wheels"], time_s
+    total, turning = ideal[CURRENT][rows], ideal[TURNING_CURRENT][rows]
+    if spike_a := outside.get("stick_slip_a", 0.0):
+        mean = speed.mean(axis=1)
+        crawls = (np.abs(mean) < CRAWL_MPS) & (np.abs(mean) > 0.02)
+        starts = rngs["outside"].random(n) < SPIKE_HZ * dt
+        lasting = np.convolve(starts & crawls, np.ones(max(1, round(SPIKE_S / dt))))[:n] > 0
+        total = total + (spike_a * np.sign(mean) * lasting)[rows]
+    if robot.on_omni_wheels:  # of the motion before the ground disturbs it
+        driven = np.ascontiguousarray(true_speed / (1.0 + p["wheel_radius_ratio"]))
+        undisturbed = move(planar, vector, dt, driven, steer, grade, roll)
+        currents = np.asarray(currents_of(planar.params, vector, dt, driven, undisturbed))[rows]
+    elif robot.skids:
+        currents = np.column_stack([total - turning, total + turning]) / 2.0
+    else:
+        currents = np.repeat(total[:, None] / wheels, wheels, axis=1)
+    at = np.arange(k + 1) * every - every // 2
+    inside = np.clip(at, 0, n - 1)
+    distance = np.vstack([np.zeros(wheels), np.cumsum(0.5 * dt * (speed[:-1] + speed[1:]), axis=0)])
+    counted = distance[inside] + ((at - inside) * dt)[:, None] * speed[inside]
+    white = np.zeros((k, wheels))
+    if noise is not None:
+        moving = active[rows]
+        jitter = rng.standard_normal((k + 1, wheels)) * noise["encoder_m"]
+        counted = counted + jitter * np.append(moving, moving[-1])[:, None]
+        if sensors.hall_steps_ratio > 0.0:
+            turns = sensors.hall_steps_ratio * motors.reduction_ratio
+            step_m = 2.0 * math.pi * robot.wheel_radius_m / turns
+            counted = np.floor(counted / step_m) * step_m
+        white_mps = sensors.motor_std_radps / motors.reduction_ratio * robot.wheel_radius_m
+        white = white_mps * rng.standard_normal((k, wheels))
+        std_a, forget_s = current_noise_a(noise, robot) / math.sqrt(wheels), noise["current_s"]
+        drawn = rng.standard_normal((wheels, k))
+        drawn = coloured(drawn, [std_a] * wheels, [forget_s] * wheels, dt * every) * moving[:, None]
+        currents = currents + drawn + sensors.current_std_a * rng.standard_normal((k, wheels))
+    measured, lag_s = (
+        np.diff(counted, axis=0) / (every * dt),
+        sensors.encoder_time_constant_s + p["encoder_lag_s"],
+    )
+    measured = np.column_stack([lagged(column.copy(), lag_s, every * dt) for column in measured.T])
+    measured[np.abs(measured) <= STANDSTILL_MPS] = 0.0
+    values = robot.logged_rates(sensing.add_rate_noise(measured, white, STANDSTILL_MPS))
+    channels = robot.rate_channels
+    if logs_currents:
+        currents = np.abs(currents) if robot.on_omni_wheels else currents  # as its logs have them
+        values = np.hstack([values, currents])
+        channels = (*channels, *sensing.wheel_channels("current_a", robot.wheels))
+    streams = {"wheels": Stream(time_s, values, channels)}
+
+    rows, time_s = samples(CAMERA_HZ)
+    camera_s = planar.body["latency_s"][0] + p["camera_latency_s"]
+    if robot.on_omni_wheels:  # poses by a camera above: the world's axes, its own noise
+        x_m, y_m, yaw_rad = (late(column, camera_s)[rows] for column in pose.T)
+        lever_m = complex(camera.lever_x_m + p["lever_x_m"], camera.lever_y_m + p["lever_y_m"])
+        marker = (x_m + 1j * y_m + np.exp(1j * yaw_rad) * lever_m) * (1.0 + p["camera_scale_ratio"])
+        seen = np.column_stack([marker.real, marker.imag, yaw_rad - p["camera_yaw_rad"]])
+        if noise is not None:
+            std_pose = np.array([camera.position_std_m, camera.position_std_m, camera.yaw_std_rad])
+            seen = seen + std_pose * rngs["camera"].standard_normal(seen.shape)
+        streams["pose"] = Stream(time_s, seen, POSE_CHANNELS)
+    else:
+        rows, time_s = samples(IMU_HZ)
+        k, rng, imu_s, level = (
+            len(rows),
+            rngs["imu"],
+            sensors.imu_latency_s + p["imu_latency_s"],
+            np.cos(grade),
+        )
+        true, (scale, bias), drawn = np.empty((k, 9)), sensing.described_imu(sensors), np.zeros((k, 9))
+        true[:, 6:8] = tilt = np.column_stack([late(angle, imu_s)[rows] for angle in (roll, -grade)])
+        true[:, :2] = np.gradient(tilt, 1.0 / IMU_HZ, axis=0)
+        true[:, 2], true[:, 3] = ideal[GYRO][rows], ideal[ACCEL][rows]  # with clock and latency already
+        side = np.gradient(v_y, dt) + turn * v_x + GRAVITY_MPS2 * np.sin(roll) * level
+        true[:, 4], true[:, 5] = (
+            late(side, imu_s)[rows],
+            late(GRAVITY_MPS2 * np.cos(roll) * level, imu_s)[rows],
+        )
+        true[:, 8] = (np.cumsum(true[:, 2]) - true[0, 2]) / IMU_HZ
+        if noise is not None:
+            sizes = np.repeat([noise["gyro_radps"], noise["accel_mps2"]], 3)
+            forget = np.repeat([noise["gyro_s"], noise["accel_s"]], 3)
+            vibration = coloured(rng.standard_normal((6, k)), sizes, forget, 1.0 / IMU_HZ)
+            still = np.repeat([sensors.gyro_std_radps, sensors.accel_std_mps2], 3)
+            drawn[:, :6] = vibration * late(active, imu_s)[rows, None] + still * rng.standard_normal((k, 6))
+            drawn[:, 6:8] = noise["tilt_rad"] * rng.standard_normal((k, 2))
+            drawn[:, 8] = sensors.yaw_std_rad * rng.standard_normal(k)
+        biases = np.tile(bias, (k, 1))
+        biases[:, 6:8] = p["roll_offset_rad"], -p["pitch_offset_rad"]
+        yaw_rate = bias[2] + drawn[:, 2]  # the fused yaw sums the measured rate
+        biases[:, 8] = (np.cumsum(yaw_rate) - yaw_rate[0]) / IMU_HZ
+        streams["imu"] = Stream(time_s, sensing.imu_values(true, scale, biases, drawn), IMU_CHANNELS)
+
+        rows, time_s = samples(CAMERA_HZ)
+        k, rng = len(rows), rngs["camera"]
+        seen = np.column_stack([ideal[SPEED_X][rows], ideal[SPEED_Y][rows]])
+        if noise is not None:
+            std, tau_s = [noise["camera_mps"]] * 2, [noise["camera_s"]] * 2
+            drawn = coloured(rng.standard_normal((2, k)), std, tau_s, 1.0 / CAMERA_HZ)
+            seen += drawn * late(active, camera_s)[rows, None]
+            seen += camera.speed_std_mps * rng.standard_normal((k, 2))
+        channels = ("speed_x_mps", "speed_y_mps")
+        if isinstance(robot, SwerveRobot):  # a tracking camera integrates its own pose
+            turned_rad = ideal[HEADING]
+            yaw = ((np.cumsum(turned_rad) - 0.5 * (turned_rad + turned_rad[0])) * dt)[rows]
+            rate, position_noise = turned_rad[rows], np.zeros((k, 2))
+            if noise is not None:
+                yaw = yaw + camera.yaw_std_rad * rng.standard_normal(k)
+                rate = rate + camera.yaw_rate_std_radps * rng.standard_normal(k)
+                position_noise = camera.position_std_m * rng.standard_normal((k, 2))
+            ahead, left = point_velocity(seen[:, 0], seen[:, 1], rate, -camera.lever_x_m, -camera.lever_y_m)
+            velocity = np.column_stack(
+                [ahead * np.cos(yaw) - left * np.sin(yaw), ahead * np.sin(yaw) + left * np.cos(yaw)]
+            )
+            position = np.cumsum(velocity, axis=0) / CAMERA_HZ + position_noise
+            angles = (late(angle, camera_s)[rows] for angle in (roll, -grade))
+            lever = np.array([camera.lever_x_m, camera.lever_y_m, camera.lever_z_m])
+            seen = sensing.camera_values(
+                position, np.column_stack([ahead, left, rate, *angles, yaw]), lever, 0.0
+            )
+            channels = CAMERA_CHANNELS
+        streams["odometry"] = Stream(time_s, seen, channels)
+
+    steered = len(robot.steer_rows)
+    names = (
+        "speed_x_mps",
+        "speed_y_mps",
+        "yaw_rate_radps",
+        *sensing.wheel_channels("wheel_radps", robot.wheels),
+    )
+    commands = np.hstack([desired.twist, desired.wheel_radps, desired.steer_rad[:, :steered]])
+    streams["commands"] = Stream(np.arange(len(twist)) / RATE_HZ, commands, (*names, *robot.steer_rows))
+    rows, time_s = samples(IMU_HZ)
+    body: Any = np.zeros(len(rows), BODY)
+    moved: Any = truth[rows]
+    tilt = grade[rows]
+    for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"):
+        body[name] = moved[name]
+    body["position_x_m"], body["position_y_m"], body["yaw_rad"] = pose[rows].T
+    body["roll_rad"], body["pitch_rad"] = roll[rows], -tilt
+    body["accel_x_mps2"] = moved["accel_x_mps2"] - GRAVITY_MPS2 * np.sin(tilt)
+    turning = moved["yaw_rate_radps"] * moved["speed_x_mps"]
+    body["accel_y_mps2"] = np.gradient(moved["speed_y_mps"], 1.0 / IMU_HZ) + turning
+    places_m = robot.wheel_positions_m * (1.0 + p["wheel_distance_ratio"])
+    motion = np.column_stack([body[name] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")])
+    along, across = wheel_frame_velocities(motion, places_m, steer[rows] + robot.wheel_directions_rad)
+    of_wheels = {
+        "wheel_radps": speed[rows] * counts / robot.wheel_radius_m,
+        "steer_rad": steer[rows],
+        "slip_ratio": slip_ratio(true_speed[rows], along),
+    }
+    more: dict[str, Any] = {
+        sensing.GYRO_BIAS: np.full(len(rows), p["gyro_bias_radps"] + sensors.gyro_bias_z_radps)
+    }
+    if isinstance(robot, BicycleRobot):
+        more |= zip(
+            sensing.wheel_channels("slip_rad", robot.wheels), slip_angle(along, across).T, strict=True
+        )
+    if robot.on_omni_wheels:
+        more[BODY_SLIP] = moved["slip_ratio"]
+    streams["truth"] = sensing.truth_stream(time_s, body, robot.wheels, of_wheels, more)
+    if steered:
+        shown, error, step_rad = steer[::every, :steered], np.zeros(1), 0.0
+        if noise is not None:
+            error = sensors.steering_std_rad * rngs["steering"].standard_normal(shown.shape)
+            if sensors.steering_steps_ratio > 0.0:
+                step_rad = 2.0 * math.pi / sensors.steering_steps_ratio
+        shown = sensing.encoder_angle(shown, robot.steering_zeros_rad[:steered], error, step_rad)
+        streams["steering"] = Stream(wheels_s, shown, robot.steer_channels)
+    if heading:  # central differences of a heading that does not depend on the gyro
+        rows, time_s = samples(CAMERA_HZ)
+        rate = ideal[HEADING][rows]
+        if noise is not None:
+            headings = noise["heading_rad"] * rngs["lidar"].standard_normal(len(rows))
+            rate = rate + np.gradient(headings, 1.0 / CAMERA_HZ)
+        streams["lidar"] = Stream(time_s, rate[:, None], ("yaw_rate_radps",))
+    if fixes:
+        at_s = np.arange(0.0, (len(body) - 1) / IMU_HZ + 1e-9, 1.0 / sensing.RAW_HZ)
+        streams |= sensing.raw_fixes(
+            at_s, body[:: round(IMU_HZ / sensing.RAW_HZ)], sensing.generators(seed, ("fixes",))["fixes"]
+        )
+    return streams, (Label(0.0, (len(twist) - 1) / RATE_HZ, terrain),) if terrain else ()
 
 
 def with_silent_parts(robot: Robot) -> Robot:
@@ -1598,12 +1600,11 @@ def with_silent_parts(robot: Robot) -> Robot:
     >>> with_silent_parts(load_robot("warthog")).sensors.gyro_std_radps
     0.0
     """
-    silent: dict[str, Part] = {}
-    for name, part in robot.completed.parts.items():
-        if name not in robot.parts:
-            unknown = [item.name for item in fields(part) if math.isnan(getattr(part, item.name))]
-            silent[name] = replace(part, **dict.fromkeys(unknown, 0.0))  # type: ignore[arg-type]
-    return robot.with_parts(**silent)
+    parts: dict[str, Any] = {n: part for n, part in robot.completed.parts.items() if n not in robot.parts}
+    for name, part in parts.items():
+        unknown = [item.name for item in fields(part) if math.isnan(getattr(part, item.name))]
+        parts[name] = replace(part, **dict.fromkeys(unknown, 0.0))
+    return robot.with_parts(**parts)
 
 
 @njit
@@ -1632,320 +1633,31 @@ def follow_commands(
     return wheel_speed, steer
 
 
-def _undulations(conditions: Conditions, rng: np.random.Generator) -> Array:
-    """Return (3, 4) of the undulations: amplitude along their two axes' direction, wave numbers, phase."""
-    if not conditions.undulation_ratio:
-        return np.zeros((0, 4))
-    direction = rng.uniform(0.0, math.pi, 3)
-    phase = rng.uniform(0.0, 2.0 * math.pi, 3)
-    size = np.full(3, conditions.undulation_ratio * math.sqrt(4.0 / 3.0))
-    number = 2.0 * math.pi / (conditions.undulation_length_m * np.array([0.7, 1.0, 1.4]))
-    return np.column_stack([size, number, direction, phase])
-
-
-@njit
 def _path(truth: Array, dt: float) -> Array:
     """Return east, north and heading (n, 3) of the body's origin, from 0."""
-    n = truth.shape[0]
-    pose = np.zeros((n, 3))
-    for k in range(1, n):
-        before, now = truth[k - 1], truth[k]
-        yaw = pose[k - 1, 2] + 0.5 * dt * (before.yaw_rate_radps + now.yaw_rate_radps)
-        middle = 0.5 * (yaw + pose[k - 1, 2])
-        x, y = 0.5 * (before.speed_x_mps + now.speed_x_mps), 0.5 * (before.speed_y_mps + now.speed_y_mps)
-        cos, sin = math.cos(middle), math.sin(middle)
-        pose[k, 0] = pose[k - 1, 0] + dt * (x * cos - y * sin)
-        pose[k, 1] = pose[k - 1, 1] + dt * (x * sin + y * cos)
-        pose[k, 2] = yaw
+    pose = np.zeros((len(truth), 3))
+    x, y, w = (
+        0.5 * (truth[name][:-1] + truth[name][1:])
+        for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
+    )
+    pose[1:, 2] = np.cumsum(dt * w)
+    middle = 0.5 * (pose[1:, 2] + pose[:-1, 2])
+    pose[1:, 0] = np.cumsum(dt * (x * np.cos(middle) - y * np.sin(middle)))
+    pose[1:, 1] = np.cumsum(dt * (x * np.sin(middle) + y * np.cos(middle)))
     return pose
 
 
-@njit
-def _tilt_along(pose: Array, grade_ratio: Array, waves: Array) -> tuple[Array, Array]:
+def _tilt_along(pose: Array, conditions: Conditions, rng: np.random.Generator) -> tuple[Array, Array]:
     """Return grade (nose up positive) and roll (left side up positive) (n,) of a body along its path."""
-    n = pose.shape[0]
-    grade, roll = np.zeros(n), np.zeros(n)
-    for k in range(n):
-        east, north = grade_ratio[0], grade_ratio[1]
-        for i in range(waves.shape[0]):
-            cos, sin = math.cos(waves[i, 2]), math.sin(waves[i, 2])
-            value = waves[i, 0] * math.cos(waves[i, 1] * (pose[k, 0] * cos + pose[k, 1] * sin) + waves[i, 3])
-            east += value * cos
-            north += value * sin
-        cos, sin = math.cos(pose[k, 2]), math.sin(pose[k, 2])
-        ahead, left = east * cos + north * sin, -east * sin + north * cos
-        grade[k] = math.atan(ahead / math.hypot(1.0, left))
-        roll[k] = math.atan(left)
-    return grade, roll
-
-
-def _wheels(run: _DrivenRun, stick_slip_a: float, logs_currents: bool) -> Stream:
-    """Return the stream of wheel speeds and, where they are logged, motor currents."""
-    robot, noise, p, wheels = run.robot, run.noise, run.p, len(run.robot.wheels)
-    sensors, motors, rng = robot.sensors, robot.motors, run.rngs["wheels"]
-    rows, time_s = run.samples(WHEELS_HZ)
-    n, every = len(rows), round(1.0 / (WHEELS_HZ * run.dt))
-    total, turning = run.channel(CURRENT)[rows], run.channel(TURNING_CURRENT)[rows]
-    if stick_slip_a:
-        total = total + _spikes(run, stick_slip_a)[rows]
-    if robot.on_omni_wheels:
-        currents = _omni_currents(run)[rows]
-    elif robot.skids:
-        currents = np.column_stack([total - turning, total + turning]) / 2.0
-    else:
-        currents = np.repeat(total[:, None] / wheels, wheels, axis=1)
-    lag_s = sensors.encoder_time_constant_s + p["encoder_lag_s"]
-    step_m, jitter, white = 0.0, np.zeros((n + 1, wheels)), np.zeros((n, wheels))
-    if noise is not None:
-        active = run.active[rows]
-        if sensors.hall_steps_ratio > 0.0:
-            turns = sensors.hall_steps_ratio * motors.reduction_ratio
-            step_m = 2.0 * math.pi * robot.wheel_radius_m / turns
-        jitter = rng.standard_normal((n + 1, wheels)) * noise.encoder_m
-        jitter *= np.append(active, active[-1])[:, None]
-        white_mps = sensors.motor_std_radps / motors.reduction_ratio * robot.wheel_radius_m
-        white = white_mps * rng.standard_normal((n, wheels))
-        std_a = np.full(wheels, noise.current_a(robot) / math.sqrt(wheels))
-        tau_s = np.full(wheels, noise.current_s)
-        drawn = coloured(rng.standard_normal((wheels, n)), std_a, tau_s, run.dt * every).T * active[:, None]
-        currents = currents + drawn + sensors.current_std_a * rng.standard_normal((n, wheels))
-    speed = encoder_speed(run.wheel_speed_mps, every, run.dt, step_m, jitter, lag_s)
-    speed[np.abs(speed) <= STANDSTILL_MPS] = 0.0
-    speed = robot.logged_rates(add_rate_noise(speed, white, STANDSTILL_MPS))
-    if not logs_currents:
-        return Stream(time_s, speed, robot.rate_channels)
-    if robot.on_omni_wheels:
-        currents = np.abs(currents)  # as its logs have them
-    channels = (*robot.rate_channels, *wheel_channels("current_a", robot.wheels))
-    return Stream(time_s, np.hstack([speed, currents]), channels)
-
-
-def _omni_currents(run: _DrivenRun) -> Array:
-    """Return the current (n, wheels) of each motor: of the motion before the ground disturbs it."""
-    wheels = np.ascontiguousarray(run.true_speed_mps / (1.0 + run.p["wheel_radius_ratio"]))
-    truth = move(run.planar, run.vector, run.dt, wheels, run.steer_rad, run.grade_rad, run.roll_rad)
-    return np.asarray(currents_of(run.planar.params, run.vector, run.dt, wheels, truth))
-
-
-def _spikes(run: _DrivenRun, size_a: float) -> Array:
-    """Return spikes (n,) of the sum of the currents while the wheels crawl."""
-    speed = run.wheel_speed_mps.mean(axis=1)
-    crawls = (np.abs(speed) < CRAWL_MPS) & (np.abs(speed) > 0.02)
-    starts = run.rngs["outside"].random(len(speed)) < SPIKE_HZ * run.dt
-    length = max(1, round(SPIKE_S / run.dt))
-    lasting = np.convolve(starts & crawls, np.ones(length))[: len(speed)] > 0
-    return np.asarray(size_a * np.sign(speed) * lasting)
-
-
-def _encoder_scales(robot: Robot, p: Any) -> Array:
-    """Return true over measured wheel rates (wheels,): encoders may lose counts."""
-    names = [f"wheel_scale_{wheel}_ratio" for wheel in robot.wheels]
-    return np.array([1.0 + p[name] if name in INDEX else 1.0 for name in names])
-
-
-@njit
-def encoder_speed(
-    wheel_speed_mps: Array, every: int, dt: float, step_m: float, jitter_m: Array, lag_s: float
-) -> Array:
-    """Return the wheel speeds (n, wheels) that encoders count: distance over a period, stamped in its middle.
-
-    Parameters
-    ----------
-    wheel_speed_mps : (m, wheels)
-    every, dt : steps a sample, and their length in s
-    step_m : of the encoder, at the circumference; 0 does not quantise
-    jitter_m : (n + 1, wheels) errors of the distances read
-    lag_s : of the low-pass behind the encoder
-    """
-    m, wheels = wheel_speed_mps.shape
-    n = (m - 1) // every + 1
-    out = np.empty((n, wheels))
-    distance = np.empty(m)
-    period = every * dt
-    for i in range(wheels):
-        distance[0] = 0.0
-        for k in range(1, m):
-            distance[k] = distance[k - 1] + 0.5 * dt * (wheel_speed_mps[k - 1, i] + wheel_speed_mps[k, i])
-        before = 0.0
-        for k in range(n + 1):
-            at = k * every - every // 2
-            inside = min(max(at, 0), m - 1)
-            reading = distance[inside] + (at - inside) * dt * wheel_speed_mps[inside, i] + jitter_m[k, i]
-            if step_m > 0.0:
-                reading = math.floor(reading / step_m) * step_m
-            if k > 0:
-                out[k - 1, i] = (reading - before) / period
-            before = reading
-        if lag_s > 0.0:
-            now, earlier, keep = lag_weights(lag_s, period)
-            last_in = last_out = out[0, i]
-            for k in range(n):
-                value = now * out[k, i] + earlier * last_in + keep * last_out
-                last_in, last_out = out[k, i], value
-                out[k, i] = value
-    return out
-
-
-def _steering(run: _DrivenRun) -> Stream:
-    """Return the stream of steering angles."""
-    sensors, channels = run.robot.sensors, run.robot.steer_channels
-    rows, time_s = run.samples(WHEELS_HZ)
-    steer, noise, step_rad = run.steer_rad[rows, : len(channels)], np.zeros(1), 0.0
-    if run.noise is not None:
-        noise = sensors.steering_std_rad * run.rngs["steering"].standard_normal(steer.shape)
-        if sensors.steering_steps_ratio > 0.0:
-            step_rad = 2.0 * math.pi / sensors.steering_steps_ratio
-    angle = encoder_angle(steer, run.robot.steering_zeros_rad[: len(channels)], noise, step_rad)
-    return Stream(time_s, angle, channels)
-
-
-def _imu(run: _DrivenRun) -> Stream:
-    """Return the stream of the IMU: gyro and accelerometer along x have clock and latency already."""
-    rows, time_s = run.samples(IMU_HZ)
-    latency_s = run.robot.sensors.imu_latency_s + run.p["imu_latency_s"]
-    v_x, v_y, turn = (run.truth[name] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"))
-    level = np.cos(run.grade_rad)
-
-    def measured(values: Array) -> Array:
-        return run.delayed(values, latency_s)[rows]
-
-    tilt = np.column_stack([measured(angle) for angle in (run.roll_rad, -run.grade_rad)])
-    rate, force = np.empty((len(rows), 3)), np.empty((len(rows), 3))
-    rate[:, :2] = np.gradient(tilt, 1.0 / IMU_HZ, axis=0)
-    rate[:, 2], force[:, 0] = run.channel("yaw_rate_radps")[rows], run.channel("accel_x_mps2")[rows]
-    force[:, 1] = measured(
-        np.gradient(v_y, run.dt) + turn * v_x + GRAVITY_MPS2 * np.sin(run.roll_rad) * level
-    )
-    force[:, 2] = measured(GRAVITY_MPS2 * np.cos(run.roll_rad) * level)
-    yaw = (np.cumsum(rate[:, 2]) - rate[0, 2]) / IMU_HZ
-    values = imu_values(_imu_errors(run, measured(run.active)), slice(None), force, rate, tilt, yaw)
-    return Stream(time_s, values, IMU_CHANNELS)
-
-
-def _imu_errors(run: _DrivenRun, active: Array) -> ImuErrors:
-    """Return the errors of the IMU: those described, and vibration while the robot moves; ``active`` (n,)."""
-    sensors, noise, n, rng = run.robot.sensors, run.noise, len(active), run.rngs["imu"]
-    scale, accel_bias, gyro_bias = described_calibration(sensors)
-    inertial, tilt, yaw = np.zeros((n, 6)), np.zeros((n, 2)), np.zeros(n)
-    if noise is not None:
-        std = np.repeat([noise.gyro_radps, noise.accel_mps2], 3)
-        tau = np.repeat([noise.gyro_s, noise.accel_s], 3)
-        vibration = coloured(rng.standard_normal((6, n)), std, tau, 1.0 / IMU_HZ)
-        white = np.repeat([sensors.gyro_std_radps, sensors.accel_std_mps2], 3)
-        inertial = vibration.T * active[:, None] + white * rng.standard_normal((n, 6))
-        tilt = noise.tilt_rad * rng.standard_normal((n, 2))
-        yaw = sensors.yaw_std_rad * rng.standard_normal(n)
-    yaw_rate = gyro_bias[2] + inertial[:, 2]  # the fused yaw sums the measured rate
-    return ImuErrors(
-        accel_scale_ratio=scale,
-        yaw_scale_ratio=1.0,
-        rate_bias_radps=np.tile(gyro_bias, (n, 1)),
-        rate_noise_radps=inertial[:, :3],
-        accel_bias_mps2=accel_bias,
-        accel_noise_mps2=inertial[:, 3:],
-        tilt_bias_rad=np.array([run.p["roll_offset_rad"], -run.p["pitch_offset_rad"]]),
-        tilt_noise_rad=tilt,
-        yaw_bias_rad=(np.cumsum(yaw_rate) - yaw_rate[0]) / IMU_HZ,
-        yaw_noise_rad=yaw,
-    )
-
-
-def _pose(run: _DrivenRun) -> Stream:
-    """Return the poses that a camera above measures of an omni robot: the world's axes, its own noise."""
-    camera, p = run.robot.camera, run.p
-    rows, time_s = run.samples(CAMERA_HZ)
-    latency_s = run.planar.body["latency_s"][0] + p["camera_latency_s"]
-    x_m, y_m, yaw_rad = (run.delayed(column, latency_s)[rows] for column in run.pose.T)
-    lever_m = complex(camera.lever_x_m + p["lever_x_m"], camera.lever_y_m + p["lever_y_m"])
-    marker = x_m + 1j * y_m + np.exp(1j * yaw_rad) * lever_m
-    marker = marker * (1.0 + p["camera_scale_ratio"])
-    seen = np.column_stack([marker.real, marker.imag, yaw_rad - p["camera_yaw_rad"]])
-    if run.noise is not None:
-        std = np.array([camera.position_std_m, camera.position_std_m, camera.yaw_std_rad])
-        seen = seen + std * run.rngs["camera"].standard_normal(seen.shape)
-    return Stream(time_s, seen, POSE_CHANNELS)
-
-
-def _camera(run: _DrivenRun) -> Stream:
-    """Return the stream of the camera: poses of a swerve robot, else speeds in body axes."""
-    camera, noise, rng = run.robot.camera, run.noise, run.rngs["camera"]
-    rows, time_s = run.samples(CAMERA_HZ)
-    n, first = len(rows), CHANNELS.index(SPEED_X)
-    latency_s = run.planar.body["latency_s"][0] + run.p["camera_latency_s"]
-    seen = run.ideal[rows, first : first + 2].copy()
-    if noise is not None:
-        active = run.delayed(run.active, latency_s)[rows]
-        std, tau = np.full(2, noise.camera_mps), np.full(2, noise.camera_s)
-        seen += coloured(rng.standard_normal((2, n)), std, tau, 1.0 / CAMERA_HZ).T * active[:, None]
-        seen += camera.speed_std_mps * rng.standard_normal((n, 2))
-    if not isinstance(run.robot, SwerveRobot):
-        return Stream(time_s, seen, ("speed_x_mps", "speed_y_mps"))
-    turn = run.channel(HEADING)
-    yaw = ((np.cumsum(turn) - 0.5 * (turn + turn[0])) * run.dt)[rows]
-    rate, position_noise = turn[rows], np.zeros((n, 2))
-    if noise is not None:
-        yaw = yaw + camera.yaw_std_rad * rng.standard_normal(n)
-        rate = rate + camera.yaw_rate_std_radps * rng.standard_normal(n)
-        position_noise = camera.position_std_m * rng.standard_normal((n, 2))
-    origin = np.column_stack(
-        point_velocity(seen[:, 0], seen[:, 1], rate, -camera.lever_x_m, -camera.lever_y_m)
-    )
+    (east, north), (x, y, yaw) = conditions.grade_ratio, pose.T
+    if conditions.undulation_ratio:
+        directions, phases = rng.uniform(0.0, math.pi, 3), rng.uniform(0.0, 2.0 * math.pi, 3)
+        size = conditions.undulation_ratio * math.sqrt(4.0 / 3.0)
+        for share, direction, phase in zip((0.7, 1.0, 1.4), directions, phases, strict=True):
+            cos, sin = math.cos(direction), math.sin(direction)
+            wave_number = 2.0 * math.pi / (conditions.undulation_length_m * share)
+            value = size * np.cos(wave_number * (x * cos + y * sin) + phase)
+            east, north = east + value * cos, north + value * sin
     cos, sin = np.cos(yaw), np.sin(yaw)
-    velocity = np.column_stack(
-        [origin[:, 0] * cos - origin[:, 1] * sin, origin[:, 0] * sin + origin[:, 1] * cos]
-    )
-    position = np.cumsum(velocity, axis=0) / CAMERA_HZ + position_noise
-    roll, pitch = (run.delayed(a, latency_s)[rows] for a in (run.roll_rad, -run.grade_rad))
-    motion = np.column_stack([origin, rate, roll, pitch, yaw])
-    lever_m = np.array([camera.lever_x_m, camera.lever_y_m, camera.lever_z_m])
-    values = np.empty((n, len(CAMERA_CHANNELS)))
-    camera_samples(position, motion, np.zeros((n, N_ERRORS)), lever_m, 0.0, values)
-    return Stream(time_s, values, CAMERA_CHANNELS)
-
-
-def _lidar(run: _DrivenRun) -> Stream:
-    """Return the rate of a heading that does not depend on the gyro, from central differences."""
-    rows, time_s = run.samples(CAMERA_HZ)
-    rate = run.channel(HEADING)[rows]
-    if run.noise is not None:
-        heading = run.noise.heading_rad * run.rngs["lidar"].standard_normal(len(rows))
-        rate = rate + np.gradient(heading, 1.0 / CAMERA_HZ)
-    return Stream(time_s, rate[:, None], ("yaw_rate_radps",))
-
-
-def _body(run: _DrivenRun) -> tuple[Array, Array]:
-    """Return stamps and the body (n,) at them, of :data:`~terrain.simulation.sensors.BODY`."""
-    rows, time_s = run.samples(IMU_HZ)
-    at, grade, body = run.truth[rows], run.grade_rad[rows], np.zeros(len(rows), BODY)
-    for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"):
-        body[name] = at[name]
-    body["position_x_m"], body["position_y_m"], body["yaw_rad"] = run.pose[rows].T
-    body["roll_rad"], body["pitch_rad"] = run.roll_rad[rows], -grade
-    body["accel_x_mps2"] = at["accel_x_mps2"] - GRAVITY_MPS2 * np.sin(grade)
-    turning = at["yaw_rate_radps"] * at["speed_x_mps"]
-    body["accel_y_mps2"] = np.gradient(at["speed_y_mps"], 1.0 / IMU_HZ) + turning
-    return time_s, body
-
-
-def _truth(run: _DrivenRun, time_s: Array, body: Array) -> Stream:
-    """Return the stream of true quantities."""
-    robot, (rows, _) = run.robot, run.samples(IMU_HZ)
-    steer = run.steer_rad[rows]
-    places_m = robot.wheel_positions_m * (1.0 + run.p["wheel_distance_ratio"])
-    twist = np.column_stack([body[name] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")])
-    along, across = wheel_frame_velocities(twist, places_m, steer + robot.wheel_directions_rad)
-    quantities = {
-        "wheel_radps": run.wheel_speed_mps[rows] * _encoder_scales(robot, run.p) / robot.wheel_radius_m,
-        "steer_rad": steer,
-        "slip_ratio": slip_ratio(run.true_speed_mps[rows], along),
-    }
-    columns: dict[str, Any] = {}
-    for quantity, values in quantities.items():
-        columns |= zip(wheel_channels(quantity, robot.wheels), values.T, strict=True)
-    columns[GYRO_BIAS] = np.full(len(rows), run.p["gyro_bias_radps"] + robot.sensors.gyro_bias_z_radps)
-    if isinstance(robot, BicycleRobot):
-        slips = slip_angle(along, across)
-        columns |= zip(wheel_channels("slip_rad", robot.wheels), slips.T, strict=True)
-    if robot.on_omni_wheels:
-        columns[BODY_SLIP] = run.truth["slip_ratio"][rows]
-    return truth_stream(time_s, body, columns)
+    ahead, left = east * cos + north * sin, -east * sin + north * cos
+    return np.arctan(ahead / np.hypot(1.0, left)), np.arctan(left)

@@ -75,22 +75,12 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.kernels import filled, inner, njit, numbers, record
 from terrain.kinematics.commands import wheel_motion
-from terrain.logs.schema import POSE_CHANNELS
+from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS
 from terrain.records import Array, Label, Stream
 from terrain.robots import Robot, TrackedRobot, as_drive
+from terrain.simulation import sensors as sensing
 from terrain.simulation.scenario import RATE_HZ, Conditions, Scenario
-from terrain.simulation.sensors import (
-    BODY,
-    COMPASS_STD_RAD,
-    GYRO_BIAS,
-    RAW_HZ,
-    RAW_STD_M,
-    generators,
-    raw_fixes,
-    truth_stream,
-    wheel_channels,
-    white_imu,
-)
+from terrain.simulation.sensors import BODY, RAW_HZ
 from terrain.slip import slip_angle, slip_ratio
 from terrain.terramechanics.soil import Soil
 from terrain.terramechanics.traction import compaction_resistance, plate_sinkage
@@ -487,8 +477,8 @@ class TrackedSensors(NamedTuple):
     tilt_rad: float = 0.002
     yaw_rad: float = 0.001
     gnss_hz: float = RAW_HZ  # raw satellite fixes; 2 cm and 10 Hz, Deremetz et al., section VI
-    gnss_m: float = RAW_STD_M
-    compass_rad: float = COMPASS_STD_RAD  # of the heading beside each fix
+    gnss_m: float = sensing.RAW_STD_M
+    compass_rad: float = sensing.COMPASS_STD_RAD  # of the heading beside each fix
     pose_hz: float = 100.0  # cameras around the field
     pose_m: float = 0.001
     pose_rad: float = 0.002
@@ -552,84 +542,67 @@ def run_tracked(
     states = np.zeros(len(belts), STATE)
     states["yaw_rad"][0] = yaw_rad
     drive_tracks(np.concatenate(tracks), np.array(slope), belts, states, STEP_S)
-    body = _body(states, slope)
-    root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
-    words = [int(word) for word in root.generate_state(4)]
-    rngs = generators(np.random.SeedSequence(words), ("bias", "wheels", "imu", "pose", "gnss"))
-    bias_radps = sensors.gyro_bias_radps * rngs["bias"].standard_normal()
-    wheels = belts[::every] + sensors.encoder_mps * rngs["wheels"].standard_normal((len(commands), 2))
-    at, time_s = _samples(len(body), sensors.pose_hz)
-    std = np.array([sensors.pose_m, sensors.pose_m, sensors.pose_rad])
-    poses = np.column_stack([body[name][at] for name in POSE_CHANNELS])
-    poses += std * rngs["pose"].standard_normal(poses.shape)
-    poses[:, 2] = wrapped(poses[:, 2])
-    fixed, fix_s = _samples(len(body), sensors.gnss_hz)
-    clock_s = np.arange(len(commands)) / RATE_HZ
-    streams = {
-        "wheels": Stream(clock_s, wheels, robot.rate_channels),
-        "imu": _imu(body, bias_radps, sensors, rngs["imu"]),
-        "pose": Stream(time_s, poses, POSE_CHANNELS),
-        **raw_fixes(fix_s, body[fixed], rngs["gnss"], sensors.gnss_m, sensors.compass_rad),
-        "commands": Stream(clock_s, commands, robot.rate_channels),
-        "truth": _truth(tracked, body, states["heap_m2"], belts, bias_radps),
-    }
-    return streams, _labels(stretches, ends_m, states)
-
-
-def _body(states: Array, slope: Slope) -> Array:
-    """Return the body (n,) at each step, of :data:`~terrain.simulation.sensors.BODY`."""
-    body = np.zeros(len(states), BODY)
+    n, turn, yaw = len(states), states["yaw_rate_radps"], states["yaw_rad"]
+    v_x, v_y, body = states["speed_x_mps"], states["speed_y_mps"], np.zeros(len(states), BODY)
     for name in set(BODY.names or ()) & set(STATE.names or ()):
         body[name] = states[name]
-    grade, body["roll_rad"] = np.array([tilt_at(*slope, yaw) for yaw in states["yaw_rad"]]).T
+    grade, body["roll_rad"] = np.array([tilt_at(*slope, at) for at in yaw]).T
     body["pitch_rad"] = -grade
-    v_x, v_y, turn = states["speed_x_mps"], states["speed_y_mps"], states["yaw_rate_radps"]
     body["accel_x_mps2"] = np.gradient(v_x, STEP_S) - turn * v_y
     body["accel_y_mps2"] = np.gradient(v_y, STEP_S) + turn * v_x
-    return body
 
-
-def _samples(n: int, rate_hz: float) -> tuple[Array, Array]:
-    """Return the steps and stamps of a sensor of a rate."""
-    if not 0.0 < rate_hz <= 1.0 / STEP_S:
-        raise ConfigError(
-            f"a sensor's rate is {rate_hz:g} Hz, above 0 and up to {1.0 / STEP_S:g} is required"
-        )
-    rows = np.arange(0, n, round(1.0 / (rate_hz * STEP_S)))
-    return rows, rows * STEP_S
-
-
-def _imu(body: Array, bias_radps: float, sensors: TrackedSensors, rng: np.random.Generator) -> Stream:
-    """Return gyro, specific force and attitude; on an even slope the body turns about its z axis alone."""
-    n, yaw = len(body), body["yaw_rad"]
+    root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+    words = [int(word) for word in root.generate_state(4)]
+    rngs = sensing.generators(np.random.SeedSequence(words), ("bias", "wheels", "imu", "pose", "gnss"))
+    bias_radps = sensors.gyro_bias_radps * rngs["bias"].standard_normal()
+    wheels = belts[::every] + sensors.encoder_mps * rngs["wheels"].standard_normal((len(commands), 2))
+    steps = {}
+    for name, rate_hz in (("pose", sensors.pose_hz), ("gnss", sensors.gnss_hz)):
+        if not 0.0 < rate_hz <= 1.0 / STEP_S:
+            raise ConfigError(
+                f"a sensor's rate is {rate_hz:g} Hz, above 0 and up to {1.0 / STEP_S:g} is required"
+            )
+        steps[name] = np.arange(0, n, round(1.0 / (rate_hz * STEP_S)))
+    std = np.array([sensors.pose_m, sensors.pose_m, sensors.pose_rad])
+    poses = np.column_stack([body[name][steps["pose"]] for name in POSE_CHANNELS])
+    poses += std * rngs["pose"].standard_normal(poses.shape)
+    poses[:, 2] = wrapped(poses[:, 2])
+    # on an even slope the body turns about its z axis alone; the heading is the integral of the gyro
+    time_s, clock_s = np.arange(n) * STEP_S, np.arange(len(commands)) / RATE_HZ
     sizes = [(sensors.gyro_radps, 3), (sensors.accel_mps2, 3), (sensors.tilt_rad, 2), (sensors.yaw_rad, 1)]
-    noise = np.hstack([std * rng.standard_normal((n, k)) for std, k in sizes])
-    rate = np.column_stack([np.zeros((n, 2)), body["yaw_rate_radps"] + bias_radps])
-    accel = np.column_stack([body["accel_x_mps2"], body["accel_y_mps2"]])
+    noise = np.hstack([std * rngs["imu"].standard_normal((n, k)) for std, k in sizes])
     drifted = yaw - yaw[0] + bias_radps * STEP_S * np.arange(n)
-    attitude = np.column_stack([body["roll_rad"], body["pitch_rad"], drifted])
-    return white_imu(np.arange(n) * STEP_S, rate, accel, attitude, noise)
-
-
-def _labels(stretches: Sequence[Stretch], ends_m: Array, states: Array) -> tuple[Label, ...]:
-    """Return the soils by time; slip that is prescribed has no name."""
+    true = sensing.tilted_imu(
+        np.column_stack([np.zeros((n, 2)), turn + bias_radps]),
+        np.column_stack([body["accel_x_mps2"], body["accel_y_mps2"]]),
+        np.column_stack([body["roll_rad"], body["pitch_rad"], drifted]),
+    )
+    # slip of each track is by its own middle
+    along = v_x[:, None] - turn[:, None] * robot.wheel_positions_m[:, 1]
+    of_wheels = {
+        "wheel_radps": belts / robot.wheel_radius_m,
+        "slip_ratio": slip_ratio(belts, along, min_speed_mps=0.005),
+    }
+    more = {
+        "yaw_rad": wrapped(yaw),
+        "slip_body_rad": slip_angle(v_x, v_y, min_speed_mps=0.005),
+        sensing.GYRO_BIAS: np.full(n, bias_radps),
+        "heap_m2": states["heap_m2"],
+    }
+    at = steps["gnss"]
+    streams = {
+        "wheels": Stream(clock_s, wheels, robot.rate_channels),
+        "imu": Stream(time_s, sensing.imu_values(true, 1.0, 0.0, noise), IMU_CHANNELS),
+        "pose": Stream(steps["pose"] * STEP_S, poses, POSE_CHANNELS),
+        **sensing.raw_fixes(at * STEP_S, body[at], rngs["gnss"], sensors.gnss_m, sensors.compass_rad),
+        "commands": Stream(clock_s, commands, robot.rate_channels),
+        "truth": sensing.truth_stream(time_s, body, robot.wheels, of_wheels, more),
+    }
+    # labels are the soils by time; slip that is prescribed has no name
     which = np.minimum(np.searchsorted(ends_m, states["travelled_m"], side="right"), len(stretches) - 1)
     labels = []
-    for k, (ground, _) in enumerate(stretches):
-        steps = np.flatnonzero(which == k)
-        if steps.size > 1 and isinstance(ground, Soil):
-            labels.append(Label(float(steps[0] * STEP_S), float(steps[-1] * STEP_S), ground.name))
-    return tuple(labels)
-
-
-def _truth(robot: TrackedRobot, body: Array, heap_m2: Array, belts: Array, bias_radps: float) -> Stream:
-    """Return the truth with the slip of each track by its own middle, and the slip angle of the body."""
-    v_x, v_y, turn = body["speed_x_mps"], body["speed_y_mps"], body["yaw_rate_radps"]
-    along = v_x[:, None] - turn[:, None] * robot.wheel_positions_m[:, 1]
-    columns: dict[str, Any] = {"yaw_rad": wrapped(body["yaw_rad"])}
-    slips = slip_ratio(belts, along, min_speed_mps=0.005)
-    for quantity, values in (("wheel_radps", belts / robot.wheel_radius_m), ("slip_ratio", slips)):
-        columns |= zip(wheel_channels(quantity, robot.wheels), values.T, strict=True)
-    columns["slip_body_rad"] = slip_angle(v_x, v_y, min_speed_mps=0.005)
-    columns |= {GYRO_BIAS: np.full(len(body), bias_radps), "heap_m2": heap_m2}
-    return truth_stream(np.arange(len(body)) * STEP_S, body, columns)
+    for k, part in enumerate(stretches):
+        inside = np.flatnonzero(which == k)
+        if inside.size > 1 and isinstance(part.ground, Soil):
+            labels.append(Label(float(inside[0] * STEP_S), float(inside[-1] * STEP_S), part.ground.name))
+    return streams, tuple(labels)

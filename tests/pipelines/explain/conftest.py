@@ -3,7 +3,7 @@ import pytest
 
 from pipelines.explain.explain import explain
 from terrain.robots import load_robot
-from terrain.simulation.plants.planar import Ground, load_noise, load_scatter
+from terrain.simulation.plants.planar import Ground, spread_numbers
 from terrain.simulation.run import simulate
 
 HIDDEN = {"camera_yaw_rad": 0.04}
@@ -18,7 +18,14 @@ def simulated(i, robot=HUSKY, effects=HIDDEN, terrain="field"):
     twist[:50] *= np.linspace(0, 1, 50)[:, None]
     about = {"run_id": f"{robot.name}_{i}", "terrain": terrain}
     return simulate(
-        robot, twist, Ground(), i, effects=effects, scatter=load_scatter(), noise=load_noise(), **about
+        robot,
+        twist,
+        Ground(),
+        i,
+        effects=effects,
+        scatter=spread_numbers("scatter"),
+        noise=spread_numbers("noise"),
+        **about,
     )
 
 

@@ -18,7 +18,7 @@ from terrain.errors import ConfigError, TerrainError
 from terrain.extension import extended_yaml
 from terrain.logs.run_folders import write_run
 from terrain.robots import description_file, load_robot
-from terrain.simulation.plants.planar import DRIVE_S, Ground, load_noise
+from terrain.simulation.plants.planar import DRIVE_S, Ground, spread_numbers
 from terrain.simulation.run import simulate, simulate_run
 from terrain.simulation.scenario import RATE_HZ as COMMANDS_HZ
 from terrain.slip_learning.learn import terrain_runs
@@ -122,7 +122,7 @@ def test_runs_that_cannot_be_compared_are_refused(a_run):
     wheels = runs[0].streams["wheels"]
     keep = ("speed_left_mps", "speed_right_mps")
     only = type(wheels)(wheels.time_s, np.column_stack([wheels.channel(name) for name in keep]), keep)
-    about = {"noise": load_noise(), "terrain": "field"}
+    about = {"noise": spread_numbers("noise"), "terrain": "field"}
     standing = [
         simulate(HUSKY, np.zeros((400, 3)), Ground(), i, run_id=f"stand_{i}", **about) for i in range(3)
     ]

@@ -34,7 +34,7 @@ from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.held import CHANNELS as TWIST_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
-from terrain.simulation.plants.planar import Ground, Scatter, load_noise, load_scatter
+from terrain.simulation.plants.planar import Ground, spread_numbers
 from terrain.simulation.run import simulate, simulate_run
 from terrain.simulation.scenario import Conditions
 
@@ -202,7 +202,7 @@ def hidden_runs(
     effects: Mapping[str, float] | Sequence[Mapping[str, float]],
     outside: Mapping[str, float] | None = None,
     *,
-    scatter: Scatter | None = None,
+    scatter: Mapping[str, float] | None = None,
     heading: bool = False,
 ) -> tuple[RunLog, ...]:
     """Return the logs of drives with effects hidden in all of them; truth and source are removed.
@@ -215,8 +215,8 @@ def hidden_runs(
     heading : log a heading that does not depend on the gyro, too
     """
     about = {
-        "scatter": scatter or load_scatter(),
-        "noise": load_noise(),
+        "scatter": scatter or spread_numbers("scatter"),
+        "noise": spread_numbers("noise"),
         "outside": outside,
         "heading": heading,
     }
@@ -342,7 +342,7 @@ RATE_HZ = 20.0  #: of all streams
 CUTOFF_HZ = 0.4 * RATE_HZ  #: above which such a log holds nothing of the motion
 
 
-def sensing_of(scatter: Scatter | None = None) -> Sensing:
+def sensing_of(scatter: Mapping[str, float] | None = None) -> Sensing:
     """Return what such logs hold, of runs with a scatter."""
     return Sensing((GYRO, SPEED_X, SPEED_Y, HEADING), CUTOFF_HZ, scatter, tilt=False)
 

@@ -47,16 +47,13 @@ from terrain.simulation.plants.planar import (
     IMU_HZ,
     WHEELS_HZ,
     Ground,
-    Noise,
     Planar,
-    Scatter,
     activity,
-    lag_weights,
-    load_noise,
-    load_scatter,
+    current_noise_a,
     make_planar,
     move,
     sense,
+    spread_numbers,
     with_silent_parts,
 )
 from terrain.simulation.run import simulate
@@ -80,7 +77,7 @@ class Sensing(NamedTuple):
 
     channels: tuple[str, ...] = ()  #: that are logged; without any those of the planar simulation
     cutoff_hz: float = 0.4 * STEP_HZ  #: above which the log holds nothing
-    scatter: Scatter | None = None  #: of the runs; that of the package by default
+    scatter: Mapping[str, float] | None = None  #: of the runs; that of the package by default
     tilt: bool = True  #: whether a tilt is logged; without one the simulation takes the ground as level
 
 
@@ -171,11 +168,12 @@ def limits_of(robot: Robot, drives: Drives, sensing: Sensing | None = None) -> L
     if not robot.describes("motors") and not sensing.channels:
         sensing = sensing._replace(channels=(*MOTION, ACCEL))  # no currents are logged
     robot = with_silent_parts(robot)
-    planar, noise, scatter = make_planar(robot, Ground()), load_noise(), sensing.scatter or load_scatter()
+    planar, noise = make_planar(robot, Ground()), spread_numbers("noise")
+    scatter = sensing.scatter or spread_numbers("scatter")
     names, nuisances = tuple(parameters_of(robot.drive)), nuisances_of(robot.drive)
     every = tuple(dict.fromkeys((*names, *nuisances)))
     free = [every.index(name) for name in nuisances]
-    std = np.array([getattr(scatter, every[i]) for i in free])
+    std = np.array([scatter[every[i]] for i in free])
     total = np.zeros((len(names), len(names)))
     lead = round(drives.lead_s * STEP_HZ)
     for twist, hills in zip(drives.twists, drives.hills, strict=True):
@@ -189,7 +187,13 @@ def limits_of(robot: Robot, drives: Drives, sensing: Sensing | None = None) -> L
 
 
 def _gram(
-    robot: Robot, planar: Planar, noise: Noise, run: RunLog, names: Sequence[str], sensing: Sensing, lead: int
+    robot: Robot,
+    planar: Planar,
+    noise: Mapping[str, float],
+    run: RunLog,
+    names: Sequence[str],
+    sensing: Sensing,
+    lead: int,
 ) -> Array:
     """Return the information (k, k) of one run from a step on, nothing free."""
     truth = run.streams["truth"]
@@ -256,7 +260,9 @@ def _predict(
     return np.asarray(sense(planar, p, dt, truth))
 
 
-def _density(noise: Noise, robot: Robot, planar: Planar, channel: str, f: Array, pace: float) -> Array:
+def _density(
+    noise: Mapping[str, float], robot: Robot, planar: Planar, channel: str, f: Array, pace: float
+) -> Array:
     """Return the one-sided spectrum of measured minus replayed: noise of channel and wheels."""
     own = noise_psd(noise, robot, planar, channel, f, pace)
     wheel_speed = noise_psd(noise, robot, planar, WHEEL_SPEED, f, pace)
@@ -313,13 +319,15 @@ def lag_gain(frequency_hz: Array, time_constant_s: float, rate_hz: float) -> Arr
     """Return the squared gain of a low-pass that takes its samples as joined by straight lines."""
     if time_constant_s == 0.0:
         return np.ones(np.shape(frequency_hz))
-    now, before, keep = lag_weights(time_constant_s, 1.0 / rate_hz)
+    keep = math.exp(-1.0 / (rate_hz * time_constant_s))
+    slope = time_constant_s * rate_hz * (1.0 - keep)
+    now, before = 1.0 - slope, slope - keep  # weights of this sample and the one before
     back = np.exp(-2j * math.pi * np.asarray(frequency_hz) / rate_hz)
     return np.asarray(np.abs((now + before * back) / (1.0 - keep * back)) ** 2)
 
 
 def noise_psd(
-    noise: Noise,
+    noise: Mapping[str, float],
     robot: Robot,
     planar: Planar,
     channel: str,
@@ -375,7 +383,7 @@ class _Spectra(NamedTuple):
     ``moving`` is the activity of the noise at that speed, 0 to 1.
     """
 
-    noise: Noise
+    noise: Mapping[str, float]
     robot: Robot
     planar: Planar
     speed_mps: float
@@ -384,7 +392,7 @@ class _Spectra(NamedTuple):
 
     def yaw_rate(self, f: Array) -> Array:
         sensors, noise = self.robot.sensors, self.noise
-        vibration = coloured_psd(f, noise.gyro_radps * self.moving, noise.gyro_s, IMU_HZ)
+        vibration = coloured_psd(f, noise["gyro_radps"] * self.moving, noise["gyro_s"], IMU_HZ)
         return self._turning(f, IMU_HZ) + vibration + white_psd(f, sensors.gyro_std_radps, IMU_HZ)
 
     def speed_ahead(self, f: Array) -> Array:
@@ -393,12 +401,12 @@ class _Spectra(NamedTuple):
 
     def speed_sideways(self, f: Array) -> Array:
         noise = self.noise
-        sideways = coloured_psd(f, noise.across_ratio * self.speed_mps, noise.across_s, CAMERA_HZ)
+        sideways = coloured_psd(f, noise["across_ratio"] * self.speed_mps, noise["across_s"], CAMERA_HZ)
         return self._seen(f) + sideways + self._turning(f, CAMERA_HZ) * self.planar.body["lever_x_m"][0] ** 2
 
     def accel(self, f: Array) -> Array:
         sensors, noise = self.robot.sensors, self.noise
-        vibration = coloured_psd(f, noise.accel_mps2 * self.moving, noise.accel_s, IMU_HZ)
+        vibration = coloured_psd(f, noise["accel_mps2"] * self.moving, noise["accel_s"], IMU_HZ)
         return vibration + self._along_rate(f) + white_psd(f, sensors.accel_std_mps2, IMU_HZ)
 
     def current(self, f: Array) -> Array:
@@ -408,40 +416,40 @@ class _Spectra(NamedTuple):
 
     def turning_current(self, f: Array) -> Array:
         robot, noise = self.robot, self.noise
-        drawn = coloured_psd(f, noise.current_a(robot) * self.moving, noise.current_s, WHEELS_HZ)
+        drawn = coloured_psd(f, current_noise_a(noise, robot) * self.moving, noise["current_s"], WHEELS_HZ)
         return drawn + white_psd(f, robot.sensors.current_std_a * math.sqrt(len(robot.wheels)), WHEELS_HZ)
 
     def wheel_speed(self, f: Array) -> Array:
         robot, motors, sensors = self.robot, self.robot.motors, self.robot.sensors
         turns = sensors.hall_steps_ratio * motors.reduction_ratio
         step_m = 2.0 * math.pi * robot.wheel_radius_m / turns if turns > 0.0 else 0.0
-        std_m = math.hypot(self.noise.encoder_m * self.moving, step_m / math.sqrt(12.0))
+        std_m = math.hypot(self.noise["encoder_m"] * self.moving, step_m / math.sqrt(12.0))
         rate = white_psd(f, std_m, WHEELS_HZ) * (2.0 * np.sin(math.pi * f / WHEELS_HZ) * WHEELS_HZ) ** 2
         rate = rate * lag_gain(f, sensors.encoder_time_constant_s + self.encoder_lag_s, WHEELS_HZ)
         white_mps = sensors.motor_std_radps / motors.reduction_ratio * robot.wheel_radius_m
         return np.asarray(rate + white_psd(f, white_mps, WHEELS_HZ))
 
     def heading_rate(self, f: Array) -> Array:
-        angle = white_psd(f, self.noise.heading_rad, CAMERA_HZ)
+        angle = white_psd(f, self.noise["heading_rad"], CAMERA_HZ)
         rate = angle * (np.sin(2.0 * math.pi * f / CAMERA_HZ) * CAMERA_HZ) ** 2
         return np.asarray(rate + self._turning(f, CAMERA_HZ))
 
     def tilt(self, f: Array) -> Array:
-        return white_psd(f, self.noise.tilt_rad, IMU_HZ)
+        return white_psd(f, self.noise["tilt_rad"], IMU_HZ)
 
     def _turning(self, f: Array, rate_hz: float) -> Array:
-        return coloured_psd(f, self.noise.yaw_radps * self.moving, self.noise.yaw_s, rate_hz)
+        return coloured_psd(f, self.noise["yaw_radps"] * self.moving, self.noise["yaw_s"], rate_hz)
 
     def _seen(self, f: Array) -> Array:
         camera, noise = self.robot.camera, self.noise
-        vibration = coloured_psd(f, noise.camera_mps * self.moving, noise.camera_s, CAMERA_HZ)
+        vibration = coloured_psd(f, noise["camera_mps"] * self.moving, noise["camera_s"], CAMERA_HZ)
         return vibration + white_psd(f, camera.speed_std_mps, CAMERA_HZ)
 
     def _along(self, f: Array) -> Array:
         """Return the density of the speed ahead, at the IMU's rate."""
         noise, slip_ratio = self.noise, self.planar.body["soft_ratio"][0, 0]
         lag = self.speed_mps * slip_ratio / GRAVITY_MPS2
-        terrain = coloured_psd(f, noise.along_ratio * self.speed_mps, noise.along_s, IMU_HZ)
+        terrain = coloured_psd(f, noise["along_ratio"] * self.speed_mps, noise["along_s"], IMU_HZ)
         if not isinstance(self.robot, SwerveRobot):
             return terrain * lag_gain(f, lag, IMU_HZ)
         w = 2.0 * math.pi * f  # a contact with a relaxation length swings

@@ -76,7 +76,7 @@ from terrain.effects import (
 from terrain.errors import DataError
 from terrain.records import RunLog
 from terrain.robots import BicycleRobot, Robot, load_robot
-from terrain.simulation.plants.planar import Ground, load_scatter
+from terrain.simulation.plants.planar import Ground, spread_numbers
 
 CLOCK = "clock_offset"  #: effect that a late logger is
 CLOCK_STATED_S = 0.04  #: largest error of its delay that is stated: two samples of the wheels' logger
@@ -150,8 +150,8 @@ class Trial:
 
 def simulation_of(robot: Robot) -> Simulation:
     """Return the simulation under test, with the known scatter from run to run."""
-    every = load_scatter()
-    scatter = {name: getattr(every, name) for name in nuisances_of(robot.drive)}
+    every = spread_numbers("scatter")
+    scatter = {name: every[name] for name in nuisances_of(robot.drive)}
     return Simulation(robot, Ground(), robot.effects, scatter)
 
 
@@ -370,9 +370,9 @@ def _late(draw: Draw) -> Stage:
 def _scattered(draw: Draw) -> Stage:
     drives, robot, n_runs = draw.rich(), draw.robot, draw.case.n_runs
     ratio = float(draw.rng.uniform(*SCATTER_RATIO))
-    scatter = load_scatter()
+    scatter = spread_numbers("scatter")
     if robot.skids:
-        scatter = scatter._replace(effective_track_ratio=ratio)
+        scatter = {**scatter, "effective_track_ratio": ratio}
     limits = limits_of(robot, drives, Sensing(scatter=scatter))
     hidden = draw.strong(limits)
     each = scattered_values(hidden.effects, draw.rng, ratio, n_runs, track=robot.skids)
@@ -439,9 +439,9 @@ def _known(draw: Draw) -> Stage:
     robot, rng, n_runs = draw.robot, draw.rng, draw.case.n_runs
     known = KNOWN[draw.case.number % len(KNOWN)]
     drives = command_drives(rng, robot, n_runs)
-    scatter, each = load_scatter(), [{TRACK_RATIO: TRACK_ERROR}] * n_runs
+    scatter, each = spread_numbers("scatter"), [{TRACK_RATIO: TRACK_ERROR}] * n_runs
     if known.scatters:
-        scatter = scatter._replace(effective_track_ratio=TRACK_SCATTER)
+        scatter = {**scatter, "effective_track_ratio": TRACK_SCATTER}
         each = scattered_values(each[0], rng, TRACK_SCATTER, n_runs, track=True)
     limits = limits_of(robot, drives, sensing_of(scatter))
     runs, places = draw.runs(drives, each, heading=True), ()

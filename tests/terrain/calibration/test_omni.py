@@ -8,7 +8,7 @@ from terrain.calibration.omni import COM_X, COM_Y, FRICTION, RADIUS, identify_om
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
-from terrain.simulation.plants.planar import Ground, load_noise
+from terrain.simulation.plants.planar import Ground, spread_numbers
 from terrain.simulation.run import simulate
 
 ROBOT = load_robot("robotino")
@@ -41,7 +41,7 @@ def drives(n=18, ratio=0.5, terrain="carpet"):
             ground,
             i,
             effects=effects,
-            noise=load_noise(),
+            noise=spread_numbers("noise"),
             run_id=f"{terrain}_{i}",
             terrain=terrain,
         )

@@ -22,10 +22,10 @@ from terrain.discrepancy.runs import Simulation
 from terrain.discrepancy.search import misfit_of
 from terrain.effects import CHANNELS, SPEED_X, vector_of
 from terrain.robots import load_robot
-from terrain.simulation.plants.planar import load_scatter
+from terrain.simulation.plants.planar import spread_numbers
 
 HUSKY = load_robot("husky")
-SCATTER = load_scatter()
+SCATTER = spread_numbers("scatter")
 NAMES = ("payload_ratio", "camera_yaw_rad", "camera_latency_s", "lever_x_m", "rolling_resistance_ratio")
 HIDDEN = {"camera_yaw_rad": 0.03}
 

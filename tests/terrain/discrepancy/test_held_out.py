@@ -25,7 +25,7 @@ from terrain.effects import CHANNELS, GYRO
 from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog
 from terrain.robots import load_robot
-from terrain.simulation.plants.planar import Ground, load_noise, load_scatter
+from terrain.simulation.plants.planar import Ground, spread_numbers
 from terrain.simulation.run import simulate
 
 HUSKY = load_robot("husky")
@@ -38,7 +38,7 @@ TWIST = np.column_stack(
 
 
 def signals(n, effects):
-    options = {"effects": effects, "scatter": load_scatter(), "noise": load_noise()}
+    options = {"effects": effects, "scatter": spread_numbers("scatter"), "noise": spread_numbers("noise")}
     return [
         signals_of(simulate(HUSKY, TWIST, Ground(), i, run_id=f"r{i}", **options), HUSKY) for i in range(n)
     ]
@@ -50,7 +50,7 @@ def longer():
 
 
 def gain(runs, effects, seed=0, scatter=True):
-    simulation = Simulation(HUSKY, scatter=load_scatter()._asdict() if scatter else {})
+    simulation = Simulation(HUSKY, scatter=spread_numbers("scatter") if scatter else {})
     return gain_of_signals(simulation, simulation.with_effects(effects), runs, seed)
 
 

@@ -12,7 +12,7 @@ from terrain.discrepancy.next_drive import next_command, next_drive
 from terrain.discrepancy.runs import low_pass_of, signals_of
 from terrain.discrepancy.verdict import Limit, NextDrive
 from terrain.robots import load_robot
-from terrain.simulation.plants.planar import Ground, load_noise
+from terrain.simulation.plants.planar import Ground, spread_numbers
 from terrain.simulation.run import simulate
 from terrain.simulation.scenario import Conditions, make_scenario
 
@@ -23,7 +23,9 @@ def drives(simulation, name, grade_deg=0.0, seeds=range(3)):
     robot, hills = simulation.robot, Conditions(grade_ratio=(np.tan(np.radians(grade_deg)), 0.0))
     twists = [make_scenario(name, robot, "grass", speed_mps=0.6, seed=seed).twist for seed in seeds]
     return [
-        simulate(robot, twist, Ground(), seed, noise=load_noise(), run_id=f"{seed}", conditions=hills)
+        simulate(
+            robot, twist, Ground(), seed, noise=spread_numbers("noise"), run_id=f"{seed}", conditions=hills
+        )
         for seed, twist in zip(seeds, twists, strict=True)
     ]
 

@@ -13,7 +13,7 @@ from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs import robotino
 from terrain.records import Stream
 from terrain.robots import load_robot
-from terrain.simulation.plants.planar import Ground, load_noise, load_scatter
+from terrain.simulation.plants.planar import Ground, spread_numbers
 from terrain.simulation.run import simulate
 
 ROBOT = load_robot("robotino")
@@ -32,7 +32,7 @@ def driven(hidden, ground=CARPET, n=16, turns=True, seed=0):
             turn = turns * rng.choice([-1.0, 0.0, 1.0]) * rng.uniform(0.3, 0.9)
             twist[k : k + 110] = speed * np.cos(angle), speed * np.sin(angle), turn
         ramp = np.cumsum(np.clip(np.diff(twist, axis=0, prepend=0.0), -9.0, 9.0), axis=0)
-        about = {"run_id": f"carpet_{i:02d}", "terrain": "carpet", "noise": load_noise()}
+        about = {"run_id": f"carpet_{i:02d}", "terrain": "carpet", "noise": spread_numbers("noise")}
         run = simulate(ROBOT, ramp, ground, 1000 * seed + i, effects=hidden, **about)
         runs.append(with_wheel_speeds(run, ROBOT))
     return runs
@@ -51,7 +51,7 @@ def without_channels(run, prefix):
 
 
 def diagnosed(runs, ground=CARPET):
-    return diagnose(runs, Simulation(ROBOT, ground, scatter=load_scatter()._asdict()))
+    return diagnose(runs, Simulation(ROBOT, ground, scatter=spread_numbers("scatter")))
 
 
 def values_of(diagnosis):
@@ -156,7 +156,7 @@ def test_rollers_of_measured_runs_are_named_and_explain_their_speed(measured, su
     """Ground softness times roller friction is what slip alone shows: 0.04 and 0.25."""
     root = measured("robotino") / "one_surface" / surface
     runs = [with_wheel_speeds(read(), ROBOT) for read in robotino.find_runs(root)][::3]
-    diagnosis = diagnose(runs, Simulation(ROBOT, scatter=load_scatter()._asdict()), showing("omni"))
+    diagnosis = diagnose(runs, Simulation(ROBOT, scatter=spread_numbers("scatter")), showing("omni"))
     assert low < values_of(diagnosis)["roller_friction_ratio"].value < high
     before, after = diagnosis.residual_before["current_a"], diagnosis.residual_after["current_a"]
     assert after.rms < 0.5 * before.rms

@@ -23,7 +23,7 @@ from terrain.discrepancy.runs import (
 from terrain.effects import CHANNELS, INDEX, ONE_SIDED, SPEED_X, STEPS, vector_of
 from terrain.errors import DataError
 from terrain.robots import load_robot
-from terrain.simulation.plants.planar import Ground, load_noise, replay
+from terrain.simulation.plants.planar import Ground, replay, spread_numbers
 from terrain.simulation.run import simulate
 from terrain.simulation.scenario import Conditions
 
@@ -198,7 +198,10 @@ def test_noise_of_the_wheels_is_not_attributed_to_a_mass_or_a_motor():
     time_s = np.arange(2001) / 50
     twist = np.zeros((time_s.size, 3))
     twist[:, 0] = np.clip(0.5 * time_s, 0.0, 0.7)
-    runs = [simulate(robot, twist, Ground(), seed, noise=load_noise(), run_id=str(seed)) for seed in range(6)]
+    runs = [
+        simulate(robot, twist, Ground(), seed, noise=spread_numbers("noise"), run_id=str(seed))
+        for seed in range(6)
+    ]
     signals, simulation = [signals_of(run, robot) for run in runs], Simulation(robot)
     low_pass = low_pass_of(signals)
     off = {}

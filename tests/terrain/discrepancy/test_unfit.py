@@ -21,7 +21,7 @@ from terrain.discrepancy.runs import low_pass_of, rows_of, signals_of
 from terrain.errors import DataError
 from terrain.records import Stream
 from terrain.robots import load_robot
-from terrain.simulation.plants.planar import Ground, load_noise, load_scatter
+from terrain.simulation.plants.planar import Ground, spread_numbers
 from terrain.simulation.run import simulate
 from terrain.simulation.scenario import Conditions, make_scenario
 
@@ -39,7 +39,14 @@ def drive(robot=HUSKY, seed=0, name="survey", ground=None, **options):
         "terrain": "grass",
     }
     return simulate(
-        robot, twist, ground or Ground(), seed, scatter=load_scatter(), noise=load_noise(), **about, **options
+        robot,
+        twist,
+        ground or Ground(),
+        seed,
+        scatter=spread_numbers("scatter"),
+        noise=spread_numbers("noise"),
+        **about,
+        **options,
     )
 
 
@@ -132,7 +139,9 @@ def of_sides(left_mps, right_mps):
     """Return a run of which the speeds of left and right are given over time, without its start from rest."""
     rate_radps = (right_mps - left_mps) / HUSKY.track_m
     twist = np.column_stack([(left_mps + right_mps) / 2, np.zeros_like(left_mps), rate_radps])
-    run = simulate(HUSKY, twist, Ground(), ODD, scatter=load_scatter(), run_id=f"run_{ODD}", terrain="grass")
+    run = simulate(
+        HUSKY, twist, Ground(), ODD, scatter=spread_numbers("scatter"), run_id=f"run_{ODD}", terrain="grass"
+    )
     wheels = run.streams["wheels"]
     driven = wheels.time_s > 2.0
     later = Stream(wheels.time_s[driven], wheels.values[driven], wheels.channels)
@@ -202,7 +211,7 @@ def runs_of(n, scatter, other=None):
         twist[:75] *= np.linspace(0.0, 1.0, 75)[:, None]
         track = (1.0 + TRACK) * np.exp(scatter * rng.standard_normal()) - 1.0
         about = {"effects": {"effective_track_ratio": (other or {}).get(i, track)}, "run_id": f"run_{i:02d}"}
-        runs.append(simulate(HUSKY, twist, Ground(), i, noise=load_noise(), **about))
+        runs.append(simulate(HUSKY, twist, Ground(), i, noise=spread_numbers("noise"), **about))
     return runs
 
 

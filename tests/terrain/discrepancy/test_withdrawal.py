@@ -22,10 +22,10 @@ from terrain.discrepancy.probes import ProbeResult, probe_residuals
 from terrain.discrepancy.search import cause_fit
 from terrain.effects import BOUNDS, CHANNELS, effect_named
 from terrain.robots import load_robot
-from terrain.simulation.plants.planar import Scatter
+from terrain.simulation.plants.planar import spread_numbers
 
 STEADY = replace(simulation_of(load_robot("husky")), scatter={})
-ALIKE = Scatter(*[0.0] * len(Scatter._fields))
+ALIKE = dict.fromkeys(spread_numbers("scatter"), 0.0)
 """A simulation of which nothing scatters, and runs that do not."""
 
 

@@ -31,7 +31,7 @@ from terrain.effects import (
 from terrain.errors import ConfigError
 from terrain.kinematics.wheels import rolling_matrix
 from terrain.robots import TrackedRobot, load_robot
-from terrain.simulation.plants.planar import Ground, load_scatter, make_planar, replay
+from terrain.simulation.plants.planar import Ground, make_planar, replay, spread_numbers
 
 HUSKY = load_robot("husky")
 ROBOTS = {
@@ -116,7 +116,7 @@ def test_names_are_unique_and_entries_are_whole():
     assert [INDEX[name] for name in PARAMETERS] == list(range(len(PARAMETERS)))
     ranks = [p.scatter_rank for p in (*PARAMETER.values(), *TILT_OFFSETS) if p.scatter_rank]
     assert sorted(ranks) == list(range(1, len(NUISANCES) + 1))
-    assert set(NUISANCES) == set(load_scatter()._fields)
+    assert set(NUISANCES) == set(spread_numbers("scatter"))
     for effect in LIBRARY:
         assert set(effect.drives) <= set(EVERY)
         assert set(effect.channels) <= set(CHANNELS)
@@ -167,7 +167,7 @@ from terrain.discrepancy.runs import Simulation
 from terrain.discrepancy.verdict import Limit, Value
 from terrain.extension import Correction, corrected
 from terrain.robots import load_robot
-from terrain.simulation.plants.dynamic import _built
+from terrain.simulation.plants.dynamic import built_with
 
 robot, name = load_robot("agrimaro"), "gear_wear_ratio"
 for table in (effects.BOUNDS, effects.STEPS, effects.NUISANCES, effects.SENSED_ONLY, effects.ONE_SIDED,
@@ -179,7 +179,7 @@ assert effects.read_effects_of(["worn=0.05"], "swerve") == {name: 0.05}
 assert Simulation(robot, effects={name: 0.05}, scatter={name: 0.1}).library[0].name == "gear_wear"
 entry = {"value": 0.05, "unit": "ratio", "source": "test"}
 assert effects.read_effects("here", {"schema": 1, "worn_ratio": entry}, "swerve")[0] == {name: 0.05}
-for extended in (corrected(replace(robot, effects={name: 0.05})), _built(robot, {name: 0.05})):
+for extended in (corrected(replace(robot, effects={name: 0.05})), built_with(robot, {name: 0.05})):
     assert extended.motors.efficiency_ratio == robot.motors.efficiency_ratio * 1.05
     assert not extended.effects
 assert quantity(name, 0.05) == "5\N{NO-BREAK SPACE}%"

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from terrain.errors import ConfigError
-from terrain.simulation.scenario import Conditions, Faults, draw_conditions, load_spread
+from terrain.simulation.scenario import Conditions, Faults, draw_conditions, field_spread
 
 
 @pytest.mark.parametrize(
@@ -37,7 +37,7 @@ def test_an_interval_that_does_not_end_after_it_starts_is_refused(name, interval
 
 
 def test_conditions_scatter_around_the_nominal_ones_as_the_spread_says():
-    spread, n = load_spread(), 800
+    spread, n = field_spread(), 800
     nominal = Conditions(
         payload_kg=5.0,
         payload_m=(0.05, -0.02),
@@ -47,13 +47,13 @@ def test_conditions_scatter_around_the_nominal_ones_as_the_spread_says():
         roughness_factor=2.0,
     )
     rng = np.random.default_rng(1)
-    drawn = [draw_conditions(spread, rng, nominal) for _ in range(n)]
+    drawn = [draw_conditions(rng, nominal) for _ in range(n)]
     cut = 0.9594  # standard deviation of a normal clipped at two
     low, high = np.sqrt(chi2.ppf([1e-5, 1 - 1e-5], n - 1) / (n - 1))
     for name, centre, std in (
-        ("grade_ratio", nominal.grade_ratio, spread.grade_std_ratio),
-        ("undulation_ratio", 0.01, spread.undulation_std_ratio),
-        ("radius_factors", nominal.radius_factors, spread.radius_std_ratio),
+        ("grade_ratio", nominal.grade_ratio, spread["grade_std_ratio"]),
+        ("undulation_ratio", 0.01, spread["undulation_std_ratio"]),
+        ("radius_factors", nominal.radius_factors, spread["radius_std_ratio"]),
     ):
         values = np.array([getattr(one, name) for one in drawn])
         np.testing.assert_allclose(values.mean(axis=0), centre, atol=4.5 * std / math.sqrt(n))
@@ -61,7 +61,9 @@ def test_conditions_scatter_around_the_nominal_ones_as_the_spread_says():
         ratio = values.std(axis=0) / std
         assert ((ratio > low * cut) & (ratio < high)).all(), name
     log = np.log([one.roughness_factor for one in drawn])
-    assert log.mean() == pytest.approx(math.log(2.0), abs=4.5 * spread.roughness_log_std_ratio / math.sqrt(n))
+    assert log.mean() == pytest.approx(
+        math.log(2.0), abs=4.5 * spread["roughness_log_std_ratio"] / math.sqrt(n)
+    )
     payload = np.array([one.payload_kg for one in drawn])
     assert 5.0 <= payload.min() < 6.0 < 34.0 < payload.max() <= 35.0
     place = np.array([one.payload_m for one in drawn]) - nominal.payload_m

@@ -12,7 +12,7 @@ from terrain.kernels import njit, record
 from terrain.logs.schema import unit_of
 from terrain.robots import load_robot
 from terrain.simulation.plants import car, planar
-from terrain.simulation.plants.planar import PLANAR_BODY, TRUTH, Ground, PlanarDrive, load_noise, load_scatter
+from terrain.simulation.plants.planar import PLANAR_BODY, TRUTH, Ground, PlanarDrive, spread_numbers
 from terrain.simulation.plants.tracks import TrackedSensors
 from terrain.simulation.run import simulate, simulate_run
 from terrain.simulation.scenario import Conditions, Faults, make_scenario
@@ -22,7 +22,7 @@ from terrain.terramechanics.soil import load_soil
 AGRIMARO, HUSKY, ROBOTINO, CAR, PATAKO = map(
     load_robot, ("agrimaro", "husky", "robotino", "adap2e", "patako")
 )
-NOISE = {"noise": load_noise(), "scatter": load_scatter()}
+NOISE = {"noise": spread_numbers("noise"), "scatter": spread_numbers("scatter")}
 
 
 def weave(sample):
@@ -119,15 +119,15 @@ def test_gravity_shows_on_a_slope_and_uphill_is_positive(plant):
 
 
 def test_noise_of_tracks_and_car_is_as_stated():
-    for plant, noise, speed in (
-        ("tracks", TrackedSensors(), "encoder_mps"),
-        ("car", car.SensorNoise(), "speed_mps"),
+    for plant, gyro_radps, yaw_rad in (
+        ("tracks", TrackedSensors().gyro_radps, 0.0087),
+        ("car", car.GYRO_RADPS, car.COMPASS_RAD),
     ):
         log = run(plant)
         truth, imu = log.streams["truth"], log.streams["imu"]
         bias = truth.channel("gyro_bias_z_radps") if plant == "tracks" else 0.0
         gyro = imu.channel("gyro_z_radps") - bias - truth.channel("yaw_rate_radps")
-        assert gyro.std() == pytest.approx(noise.gyro_radps, rel=0.15)
+        assert gyro.std() == pytest.approx(gyro_radps, rel=0.15)
         fixes = (
             log.streams["gnss"].channel("position_x_m")
             - truth.channel("position_x_m")[::10][: len(log.streams["gnss"])]
@@ -137,8 +137,7 @@ def test_noise_of_tracks_and_car_is_as_stated():
             log.streams["compass"].values[:, 0]
             - truth.channel("yaw_rad")[::10][: len(log.streams["compass"])]
         )
-        assert np.std(wrapped(yaw)) == pytest.approx(0.0087 if plant == "tracks" else noise.yaw_rad, rel=0.3)
-        assert getattr(noise, speed) > 0.0
+        assert np.std(wrapped(yaw)) == pytest.approx(yaw_rad, rel=0.3)
 
 
 def test_an_effect_of_the_sensors_and_another_logger_leave_all_else_alone():

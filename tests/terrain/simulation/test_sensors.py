@@ -10,6 +10,7 @@ from scipy.stats import chi2, poisson
 from terrain.constants import GRAVITY_MPS2
 from terrain.kinematics.camera import body_motion, odometry_stream
 from terrain.robots import load_robot
+from terrain.simulation.plants.dynamic import dynamic_truth
 from terrain.simulation.scenario import NO_FAULTS, Faults
 from terrain.simulation.sensors import (
     BODY_ROW,
@@ -23,7 +24,6 @@ from terrain.simulation.sensors import (
     imu_sensor,
     steering_sensor,
     wheel_sensor,
-    wheels_truth,
 )
 
 ROBOT = load_robot("agrimaro")
@@ -199,7 +199,7 @@ def test_a_bias_walks_and_the_yaw_drifts_with_it():
     assert_std(
         imu.channel("yaw_rad") - drift, sensors.yaw_std_rad, 0.0
     )  # it begins at 0, whatever the heading
-    truth = wheels_truth(motion_of(100.0), bias, imu.time_s)
+    truth = dynamic_truth(motion_of(100.0), bias, imu.time_s)
     np.testing.assert_allclose(truth.channel("gyro_bias_z_radps"), bias, rtol=0, atol=1e-15)
 
 
@@ -396,7 +396,7 @@ def test_the_truth_is_what_happened_and_a_slip_that_never_was_is_no_channel():
         accel_y_mps2=0.3,
         side_n=[[4.0, 5.0, 6.0]],
     )
-    truth = wheels_truth(motion, np.array([0.1, 0.2]), np.array([0.0, 0.5]))
+    truth = dynamic_truth(motion, np.array([0.1, 0.2]), np.array([0.0, 0.5]))
     assert "slip_1_ratio" not in truth.channels
     np.testing.assert_array_equal(truth.channel("slip_2_ratio"), slip[::10, 1])
     assert truth.values[7, [truth.channels.index(f"normal_{i}_n") for i in (1, 2, 3)]].tolist() == [

@@ -11,17 +11,10 @@ from terrain.errors import ConfigError, DataError
 from terrain.logs.run_folders import read_run, write_run
 from terrain.records import Command
 from terrain.robots import load_robot
-from terrain.simulation.plants.dynamic import (
-    DrivenPlant,
-    advance,
-    make_plant,
-    settle,
-    start_state,
-    uniform_profile,
-)
+from terrain.simulation.plants import dynamic
 from terrain.simulation.run import simulate
 from terrain.simulation.scenario import Conditions, Faults, Scenario, make_scenario
-from terrain.simulation.sensors import BODY_ROW, Gnss
+from terrain.simulation.sensors import Gnss
 from terrain.terramechanics.soil import Scatter, load_soil, soil_names
 
 ROBOT = load_robot("agrimaro")
@@ -116,7 +109,7 @@ def test_a_ground_that_is_crossed_in_a_moment_gets_no_label():
 def test_terrain_varies_along_the_path_as_soil_and_conditions_state(monkeypatch):
     plants = []
 
-    def noted(plant, profile, state, wheel, steer, substeps, noise, rows):
+    def noted(plant, profile, state, wheel, steer, noise, rows):
         plants.append(profile)
         rows[:] = np.zeros(1, rows.dtype)
 
@@ -247,31 +240,24 @@ def test_the_readings_of_a_controller_equal_the_log(scenario, terrain, options, 
     assert read_run(write_run(run, tmp_path)).streams["truth"].channels == truth.channels
 
 
-@pytest.mark.parametrize("delay", [1, 33, 500])
-def test_pieces_between_commands_are_the_drive_in_which_each_step_has_its_own(delay):
-    rng = np.random.default_rng(delay)
-    soil = SOILS["clay"]
-    conditions = Conditions(
-        payload_kg=10.0, payload_m=(0.1, 0.0), grade_ratio=(0.03, 0.02), leg_backlash_rad=0.02
-    )
-    plant, profile = make_plant(ROBOT, conditions), uniform_profile(ROBOT, soil, roughness_m3=1e-4)
-    n, substeps = 60, 20
-    wheel, steer = 4 * rng.random((n, 3)), 0.3 * rng.standard_normal((n, 3))
-    noise = rng.standard_normal((n * substeps, 3))
-    start = start_state(np.zeros(3))
-    settle(plant, profile, start)
-    one, other = start.copy(), start.copy()
-    pieces, whole = np.zeros(n * substeps, BODY_ROW), np.zeros(n * substeps, BODY_ROW)
-    drive = DrivenPlant(plant, profile, one, noise, pieces)
-    for k in range(n):
-        assert drive.until(k * substeps + 1)
-        drive.command(k * substeps + delay, wheel[k], steer[k])
-    assert drive.until(n * substeps)
-    tick = (np.arange(n * substeps) - delay) // substeps
-    held_wheel, held_steer = (np.where(tick[:, None] >= 0, rows[tick], 0.0) for rows in (wheel, steer))
-    advance(plant, profile, other, held_wheel, held_steer, 1, noise, whole)
-    assert one.tobytes() == other.tobytes()
-    assert pieces.tobytes() == whole.tobytes()
+@pytest.mark.parametrize("delay", [0, 33, 500])
+def test_a_command_is_in_force_from_its_delay_to_that_of_the_next(delay, monkeypatch):
+    given, advance, drive = [], dynamic.advance, make_scenario("straight", ROBOT, "clay", 4.0)
+    wheel = 4 * np.random.default_rng(delay).random((len(drive.time_s), 3))
+    rows = iter(wheel)
+
+    def noted(plant, profile, state, wheel, *rest):
+        given.append(wheel.copy())
+        advance(plant, profile, state, wheel, *rest)
+
+    def controller(sample):
+        return STAND._replace(wheel_radps=next(rows))
+
+    monkeypatch.setattr(dynamic, "advance", noted)
+    run_of(drive, "clay", controller=controller, command_delay_s=delay / 1000)
+    given = np.concatenate(given)[-20 * len(wheel) :]  # the robot was settled before
+    tick = (np.arange(len(given)) - max(delay, 1)) // 20
+    np.testing.assert_array_equal(given, np.where(tick[:, None] >= 0, wheel[tick], 0.0))
 
 
 @pytest.mark.parametrize("delay_s", [0, np.float64(0.123), 0.5])

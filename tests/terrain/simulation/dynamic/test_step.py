@@ -22,10 +22,10 @@ from terrain.simulation.plants.dynamic import (
     check_step,
     contact_ratio,
     make_plant,
+    patches_on,
     settle,
     start_state,
     tyre_ratio,
-    uniform_profile,
 )
 from terrain.simulation.scenario import Conditions
 from terrain.simulation.sensors import BODY_ROW, STEP_S, Motion
@@ -59,8 +59,8 @@ class Driven(NamedTuple):
 def plant_of(*soils, roughness_m3=0.0, starts_m=(0.0,), backlash_rad=0.0, com_height_m=None, **changes):
     """Return the plant of the robot on even ground without scatter; no play unless it is asked for."""
     field = changes.pop("field", np.ones((2, 3, 1)))
-    profile = uniform_profile(ROBOT, *soils, roughness_m3=roughness_m3, start_m=starts_m)
-    plant = Driven(make_plant(ROBOT, Conditions(**changes)), profile._replace(field=field))
+    profile = TerrainProfile(patches_on(ROBOT, soils, [roughness_m3] * len(soils), starts_m), field)
+    plant = Driven(make_plant(ROBOT, Conditions(**changes)), profile)
     if com_height_m is not None:
         ratio = plant.load_per_force_ratio * com_height_m / plant.com_height_m
         plant = plant.changed(com_height_m=com_height_m, load_per_force_ratio=ratio)
@@ -76,7 +76,8 @@ def drive(plant, wheel_radps, steer_rad=None, seed=None, settled=False, substeps
     rows, state = np.empty(n, BODY_ROW), start_state(np.zeros(3))
     if settled:
         settle(*plant, state)
-    advance(*plant, state, wheel, steer, substeps, noise, rows)
+    held = (np.repeat(commands, substeps, axis=0) for commands in (wheel, steer))
+    advance(*plant, state, *held, noise, rows)
     return Motion(rows)
 
 
@@ -232,7 +233,8 @@ def test_a_drive_with_everything_in_it_is_that_of_the_plain_form():
     noise = rng.standard_normal((75 * SUBSTEPS, 3))
     plain = reference(plant, wheel, steer, SUBSTEPS, noise, steer_0=0.015)
     rows, state = np.empty(len(noise), BODY_ROW), start_state(np.full(3, 0.015))
-    advance(*plant, state, wheel, steer, SUBSTEPS, noise, rows)
+    held = (np.repeat(commands, SUBSTEPS, axis=0) for commands in (wheel, steer))
+    advance(*plant, state, *held, noise, rows)
     motion = Motion(rows)
     assert plain["path"][-1] > 0.7  # on all three grounds
     assert np.ptp(motion.record["leg_rad"]) > 0.03  # and through its play
@@ -323,8 +325,8 @@ def test_mirrored_commands_give_mirrored_motion():
             load_soil("grass"), roughness_m3=1e-3, grade_ratio=(sign * 0.05, 0.03), backlash_rad=0.02
         )
         rows, state = np.empty(2000, BODY_ROW), start_state(np.zeros(3))
-        args = (np.ascontiguousarray(sign * a[:, order]) for a in (wheel, steer))
-        advance(*plant, state, *args, SUBSTEPS, np.ascontiguousarray(noise[:, order]), rows)
+        args = (np.repeat(sign * a[:, order], SUBSTEPS, axis=0) for a in (wheel, steer))
+        advance(*plant, state, *args, np.ascontiguousarray(noise[:, order]), rows)
         motions.append(Motion(rows))
     there, mirrored = motions
     body = "yaw_rad speed_x_mps yaw_rate_radps ride_pitch_rad"

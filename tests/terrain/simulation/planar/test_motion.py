@@ -22,8 +22,8 @@ from terrain.robots import load_robot
 from terrain.simulation.plants.dynamic import DEFLECTION_DAMPING_S, shear_slip
 from terrain.simulation.plants.planar import (
     ENDO_POWER,
+    RESTING_MPS,
     ROLLING_MPS,
-    STANDSTILL_MPS,
     Ground,
     direction,
     make_planar,
@@ -290,7 +290,7 @@ def test_forces_and_currents_balance(robot):
     planar = make_planar(robot, ground)
     weight = robot.mass_kg * GRAVITY_MPS2
     grade, speed = 0.07, 0.5
-    slow = ROLLING_MPS if robot is AGRIMARO else STANDSTILL_MPS
+    slow = ROLLING_MPS if robot is AGRIMARO else RESTING_MPS
 
     def direction(speed_mps):
         return speed_mps / math.hypot(speed_mps, slow)

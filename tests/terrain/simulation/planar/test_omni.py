@@ -17,9 +17,9 @@ from terrain.simulation.plants.planar import (
     SUBSTEPS,
     Ground,
     currents_of,
-    load_noise,
     make_planar,
     move,
+    spread_numbers,
     steady_twist,
 )
 from terrain.simulation.run import simulate
@@ -133,7 +133,9 @@ def test_currents_are_those_of_friction_where_nothing_resists_and_grow_with_the_
 def driven(direction_rad, seed=0, ground=CARPET, speed_mps=0.2, seconds=6.0, effects=None):
     twist = np.zeros((int(50 * seconds) + 1, 3))
     twist[25:] = heading_to(direction_rad, speed_mps)
-    run = simulate(ROBOT, twist, ground, seed, noise=load_noise(), terrain="carpet", effects=effects)
+    run = simulate(
+        ROBOT, twist, ground, seed, noise=spread_numbers("noise"), terrain="carpet", effects=effects
+    )
     return with_wheel_speeds(run, ROBOT)
 
 
@@ -181,8 +183,10 @@ def test_an_effect_with_a_home_moves_the_robot_as_that_description_does(values):
 
 def test_what_the_ground_adds_to_the_motion_is_in_no_current():
     """Noise of the motion has no force: measured currents are those of the motion without it."""
-    quiet = load_noise()._replace(along_ratio=0.0, across_ratio=0.0, yaw_radps=0.0)
-    rough = load_noise()._replace(along_ratio=0.05, across_ratio=0.05, yaw_radps=0.05)
+    quiet, rough = (
+        spread_numbers("noise") | dict.fromkeys(("along_ratio", "across_ratio", "yaw_radps"), size)
+        for size in (0.0, 0.05)
+    )
     twist = np.zeros((301, 3))
     twist[25:] = heading_to(0.4)
     one, other = (simulate(ROBOT, twist, CARPET, 3, noise=noise).streams for noise in (quiet, rough))

@@ -26,11 +26,10 @@ from terrain.robots import load_robot
 from terrain.signals import low_passed
 from terrain.simulation.plants.planar import (
     Ground,
-    load_noise,
-    load_scatter,
     make_planar,
     planar_ground,
     replay,
+    spread_numbers,
 )
 from terrain.simulation.run import simulate
 from terrain.simulation.scenario import Conditions, make_scenario
@@ -40,7 +39,7 @@ HUSKY, AGRIMARO, CAR = (load_robot(name) for name in ("husky", "agrimaro", "adap
 ROBOTS = [HUSKY, AGRIMARO]
 NAMES = ["husky", "agrimaro"]
 HILLS = Conditions(grade_ratio=(0.04, -0.03), undulation_ratio=0.04)
-NOISE, SCATTER = load_noise(), load_scatter()
+NOISE, SCATTER = spread_numbers("noise"), spread_numbers("scatter")
 
 
 def drive(robot, scenario="complex", length_s=60.0, speed_mps=0.6):
