@@ -728,8 +728,8 @@ def run_dynamic(
             one, two, three = rows["wheels"]["patch_ratio"][step].tolist()
             terrain = scenario.patches[int(one)].terrain if one == two == three else ""
             command = controller(Sample(time_s, scenario.twist[k], readings, terrain))
-            decided[k], told = _checked(command, status[0] if status else None, time_s)
-            status.append(told)
+            decided[k], row_status = _checked(command, status[0] if status else None, time_s)
+            status.append(row_status)
             in_force = slice(step + delay_steps, step + delay_steps + substeps)
             wheel_radps[in_force], steer_rad[in_force] = decided[k, 3:6], decided[k, 6:]
         else:

@@ -92,13 +92,13 @@ def test_the_form_is_generalised_least_squares_with_scatter_written_out(info):
 
 def test_a_nuisance_is_a_parameter_too_and_its_scatter_widens_its_variance(info, problem):
     assert info.names[: len(NAMES)] == NAMES
-    assert set(np.array(info.names)[info.nuisances]) == set(SCATTER._fields)
+    assert set(np.array(info.names)[info.nuisances]) == set(SCATTER)
     steady = problem._replace(simulation=Simulation(HUSKY))
     firm = steady.at(info.vector, NAMES, info.statistics._replace(scatter={}))
     name = ["rolling_resistance_ratio"]  # which scatters
     wide, narrow = fit_change(info, name)[1][0, 0], fit_change(firm, name)[1][0, 0]
     # the mean over runs cannot be better known than its scatter lets
-    assert wide > SCATTER.rolling_resistance_ratio**2 / len(info.rows) > narrow
+    assert wide > SCATTER["rolling_resistance_ratio"]**2 / len(info.rows) > narrow
     assert firm.nuisances.size == 0
     here = steady.near(firm, info.vector, NAMES)
     scale = np.sqrt(here.a.diagonal())
