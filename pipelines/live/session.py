@@ -27,7 +27,7 @@ from terrain.control.live_state import LiveState
 from terrain.control.robot_control import PilotSettings
 from terrain.control.slip_table import SlipTable
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.clocks import Inbox, SessionClock, StreamHealth, numbers
+from terrain.estimation.clocks import Inbox, SessionClock, numbers
 from terrain.estimation.live import LiveEstimate
 from terrain.records import Sample
 from terrain.robots import Robot
@@ -156,7 +156,7 @@ class RobotSession:
         leave: Callable[[str, str], None] = lambda code, sentence: None,
     ) -> None:
         self.hello, self.served, self.leave = hello, served, leave
-        self.inbox = Inbox({stream: len(names) for stream, names in hello.streams.items()})
+        self.inbox = Inbox(hello.streams)
         pilot = PilotSettings(follows=hello.follows) if hello.control else None
         if pilot is not None and robot is None:
             raise ConfigError(
@@ -164,7 +164,6 @@ class RobotSession:
             )
         self.chain = chain_of(robot, hello.streams, served.model, served.table, pilot, thread)
         self._wheels = () if robot is None else robot.wheels
-        self._streams = StreamHealth(hello.streams)
         self._clock = SessionClock()
         self._twist, self._twist_s = _NO_TWIST, -math.inf
         self._sampled_s = self._known_s = math.nan
@@ -284,8 +283,8 @@ class RobotSession:
         """
         begun_s = monotonic()
         now_s = begun_s if now_s is None else now_s
-        readings = self.inbox.take()
         time_s = self._clock.at(now_s) if time_s is None else time_s
+        readings = self.inbox.take(time_s)
         fresh = now_s - self._twist_s <= TWIST_FRESH_S
         twist = self._twist if fresh else _NO_TWIST
         done = self.chain.take(Sample(time_s, twist, readings))
@@ -294,7 +293,6 @@ class RobotSession:
         if done.windows:
             found = {name: getattr(done.windows[-1], name) for name in WINDOW}
             self._window = {name: None if value == "" else value for name, value in found.items()}
-        self._streams.take(readings, time_s)
         if self._recorder is not None:
             self._recorder.readings(readings)
             self._recorder.step(time_s, twist, done)
@@ -326,11 +324,11 @@ class RobotSession:
         else:
             known = dict.fromkeys(SEEN[:2], np.full(len(self._wheels), math.nan))
             for name, channel in (("wheel_speed_mps", "speed_{}_mps"), ("current_a", "current_{}_a")):
-                known[name] = self._streams.last("wheels", [channel.format(wheel) for wheel in self._wheels])
+                known[name] = self.inbox.last("wheels", [channel.format(wheel) for wheel in self._wheels])
             known |= dict.fromkeys(MOTION, math.nan)
             if seen is not None and len(seen.slip) == len(self._wheels):
                 known |= {"slip_ratio": seen.slip, "slip_std": seen.slip_std}
-        sensors = self.chain.health or self._streams.health(time_s)
+        sensors = self.chain.health or self.inbox.health(time_s)
         if math.isnan(time_s):
             sensors = dict.fromkeys(sensors, "lost")
         return {

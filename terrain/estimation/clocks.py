@@ -10,12 +10,16 @@ What is later without a jump is late, however long, and left out.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
+from terrain.errors import ConfigError
+from terrain.estimation.feed import OFF_CLOCK_S, TICK_S
 from terrain.records import Array, Reading
 
 PERIOD_S = 0.02  #: Time that passes at a step whose time does not say.
@@ -37,6 +41,11 @@ MAX_QUEUED = 20_000
 LOST_AFTER_S, PERIODS = 0.5, 3.0
 #: When samples came last that were too late to be taken, and by how much, of what never had any.
 NEVER = -math.inf, math.nan
+#: Samples of a stream that wait for the wheels; five seconds of a camera.
+QUEUE = 1024
+CLOCK_SET_S = 1.0  #: Samples that are so far behind, many in a row, are of a clock that was set back.
+Due = list[tuple[float, bool, Array]]
+"""Of samples their stamp, whether all of their numbers are finite, and those, NaN where they are not."""
 
 
 def number(value: Any) -> float:
@@ -65,14 +74,12 @@ def numbers(value: Any) -> Array | None:
         return value
     try:
         array = np.asarray(value)
-        is_mixed = array.dtype.kind == "O" and all(map(_is_number, array.ravel().tolist()))
-        return array.astype(np.float64, copy=False) if is_mixed or array.dtype.kind in "fiu" else None
+        for one in array.ravel().tolist() if array.dtype.kind == "O" else ():
+            if not (one is None or type(one) is float or (type(one) is int and abs(one) < 2**63)):
+                return None
+        return array.astype(np.float64, copy=False) if array.dtype.kind in "fiuO" else None
     except Exception:
         return None
-
-
-def _is_number(value: Any) -> bool:
-    return value is None or type(value) is float or (type(value) is int and abs(value) < 2**63)
 
 
 def finite_twist(given: object) -> Array:
@@ -86,15 +93,12 @@ def finite_twist(given: object) -> Array:
 def readable(given: Any) -> Reading | None:
     """Return a reading as arrays (k,) and (k, c); None where it is not that."""
     try:
-        time_s, values = given
+        stamps, values = map(numbers, given)
     except Exception:
         return None
-    stamps, array = numbers(time_s), numbers(values)
-    if stamps is None or array is None or stamps.ndim != 1 or array.ndim != 2 or len(array) != stamps.size:
+    if stamps is None or values is None or stamps.ndim != 1 or values.ndim != 2 or len(values) != stamps.size:
         return None
-    if type(given) is Reading and stamps is time_s and array is values:
-        return given
-    return Reading(stamps, array)
+    return Reading(stamps, values)
 
 
 def last_stamp_s(samples: Mapping[str, Reading], stream: str) -> float:
@@ -321,12 +325,80 @@ class ClockWatch:
         return False
 
 
+def check_channels(stream: str, names: Iterable[str], known: Sequence[str]) -> None:
+    """Raise ``ConfigError`` where a stream that is read sample by sample lacks a channel."""
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"channels of {stream!r} are {list(known)}: {name!r} must be among them")
+
+
+class SampleQueue:
+    """Samples of a stream that wait for the wheels, in order of their stamps: late ones go where they belong.
+
+    Of two of which one is further ahead than any is late, one has a wrong stamp, and goes.
+
+    Attributes
+    ----------
+    waiting : samples that are not due
+    taken_s : stamp of the last one that was taken out
+    n_behind : samples in a row that are stamped long before that one
+    counts : of samples left out, by kind
+    """
+
+    def __init__(self, columns: Array) -> None:
+        """``columns`` say where each channel stands in the readings, -1 where it does not."""
+        self._columns, self._is_lacking = columns, columns < 0
+        self.waiting: Due = []
+        self.taken_s, self.n_behind = -math.inf, 0
+        self.counts: Counter[str] = Counter()
+
+    def push(self, time_s: Array, values: Array) -> None:
+        """Queue samples."""
+        samples = np.ascontiguousarray(values[:, self._columns])  # one layout: one compiled form
+        samples[:, self._is_lacking] = np.nan
+        finite = np.isfinite(samples)
+        samples[~finite] = np.nan
+        finite[:, self._is_lacking] = True
+        waiting, are_whole = self.waiting, np.all(finite, axis=1).tolist()
+        for stamp_s, is_whole, sample in zip(time_s.tolist(), are_whole, samples, strict=True):
+            place = bisect_left(waiting, stamp_s, key=itemgetter(0))
+            is_known = place < len(waiting) and waiting[place][0] == stamp_s
+            if is_known or not self.taken_s < stamp_s < math.inf:
+                self.counts["stamp does not increase"] += 1
+                self.n_behind = self.n_behind + 1 if stamp_s <= self.taken_s - CLOCK_SET_S else 0
+                continue
+            if waiting and waiting[-1][0] - stamp_s > REWIND_S:
+                self.counts["stamp does not increase"] += 1
+                if len(waiting) > 1 and waiting[-2][0] - stamp_s > REWIND_S:
+                    continue
+                waiting.pop()
+            if len(waiting) == QUEUE:
+                self.counts["waited too long"] += QUEUE // 2
+                del waiting[: QUEUE // 2]
+                place = max(place - QUEUE // 2, 0)
+            waiting.insert(place, (stamp_s, is_whole, sample))
+            self.n_behind = 0
+
+    def take(self, time_s: float) -> Due:
+        """Take out what came by a tick; what is stamped far ahead of it goes."""
+        waiting = self.waiting
+        n = next((k for k, (stamp_s, _, _) in enumerate(waiting) if stamp_s > time_s + TICK_S), len(waiting))
+        due = waiting[:n]
+        del waiting[:n]
+        if due:
+            self.taken_s = due[-1][0]
+        while waiting and waiting[-1][0] > time_s + OFF_CLOCK_S:
+            self.counts["off the clock"] += 1
+            waiting.pop()
+        return due
+
+
 class Inbox:
-    """Queue rows of streams, in the order in which they come.
+    """Queue rows of streams, in the order in which they come; judge whether each comes, and keep its last values.
 
     Parameters
     ----------
-    channels : number of columns by stream
+    channels : by stream
 
     Attributes
     ----------
@@ -335,29 +407,31 @@ class Inbox:
 
     Examples
     --------
-    >>> inbox = Inbox({"imu": 2})
+    >>> inbox = Inbox({"imu": ("gyro_z_radps", "accel_x_mps2")})
     >>> inbox.put("imu", [0.0, 0.01], [[1.0, 2.0], [3.0, None]])
     0.01
-    >>> inbox.take()["imu"].values.tolist()
-    [[1.0, 2.0], [3.0, nan]]
+    >>> inbox.take(0.02)["imu"].values.tolist(), inbox.health(0.2), inbox.health(1.0)
+    ([[1.0, 2.0], [3.0, nan]], {'imu': 'not finite'}, {'imu': 'lost'})
     >>> inbox.put("imu", [0.0], [[1.0]]), dict(inbox.refused)
     (None, {'imu: not rows of 2 numbers': 1})
     """
 
-    def __init__(self, channels: Mapping[str, int]) -> None:
-        self._n_columns = dict(channels)
+    def __init__(self, channels: Mapping[str, Sequence[str]]) -> None:
+        self._channels = dict(channels)
         self._queued: dict[str, list[Reading]] = {name: [] for name in channels}
-        self._n_queued = dict.fromkeys(channels, 0)
+        self._n_queued: Counter[str] = Counter()
         self.received: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
+        self._last_s = dict.fromkeys(channels, math.nan)
+        self._period_s = dict.fromkeys(channels, 0.0)
+        self._values: dict[str, Array] = {}
 
     def put(self, stream: str, time_s: Any, values: Any) -> float | None:
         """Queue rows; return their newest stamp, or None where they were refused and counted."""
-        n_columns = self._n_columns.get(stream)
-        if n_columns is None:
+        if stream not in self._channels:
             self.refused["stream that was not announced"] += 1
             return None
-        stamps, rows = numbers(time_s), numbers(values)
+        stamps, rows, n_columns = numbers(time_s), numbers(values), len(self._channels[stream])
         if stamps is None or rows is None or rows.shape != (stamps.size, n_columns) or stamps.ndim != 1:
             self.refused[f"{stream}: not rows of {n_columns} numbers"] += 1
             return None
@@ -371,48 +445,20 @@ class Inbox:
             n = queued.pop(0).time_s.size
             self._n_queued[stream] -= n
             self.refused[f"{stream}: too many wait"] += n
-        finite = stamps[np.isfinite(stamps)]
-        return float(finite.max()) if finite.size else None
+        return max(filter(math.isfinite, stamps.tolist()), default=None)
 
-    def take(self) -> dict[str, Reading]:
-        """Return what is queued, as one reading a stream, and empty the queue."""
+    def take(self, time_s: float) -> dict[str, Reading]:
+        """Return what is queued at a time of the robot's clock, as one reading a stream, and empty the queue."""
         taken = {}
         for stream, queued in self._queued.items():
             if queued:
-                joined = Reading(*map(np.concatenate, zip(*queued, strict=True))) if queued[1:] else queued[0]
-                taken[stream], self._queued[stream], self._n_queued[stream] = joined, [], 0
-        return taken
-
-
-class StreamHealth:
-    """Judge whether each stream comes, and keep its last values.
-
-    Parameters
-    ----------
-    channels : by stream
-
-    Examples
-    --------
-    >>> health = StreamHealth({"imu": ("gyro_z_radps",)})
-    >>> health.take({"imu": Reading(np.array([1.0]), np.array([[0.1]]))}, 1.0)
-    >>> health.health(1.2), health.health(2.0)
-    ({'imu': 'fresh'}, {'imu': 'lost'})
-    """
-
-    def __init__(self, channels: Mapping[str, Sequence[str]]) -> None:
-        self._channels = {stream: tuple(names) for stream, names in channels.items()}
-        self._last_s = dict.fromkeys(channels, math.nan)
-        self._period_s = dict.fromkeys(channels, 0.0)
-        self._values: dict[str, Array] = {}
-
-    def take(self, readings: Mapping[str, Reading], time_s: float) -> None:
-        """Note what came by a time of the robot's clock."""
-        for stream, reading in readings.items():
-            if len(reading.values):
-                step_s = (time_s - self._last_s[stream]) / len(reading.values)
+                taken[stream] = Reading(*map(np.concatenate, zip(*queued, strict=True)))
+                step_s = (time_s - self._last_s[stream]) / len(taken[stream].values)
                 if 0.0 < step_s < 10.0:
                     self._period_s[stream] = step_s
-                self._last_s[stream], self._values[stream] = time_s, reading.values[-1]
+                self._last_s[stream], self._values[stream] = time_s, taken[stream].values[-1]
+                self._queued[stream], self._n_queued[stream] = [], 0
+        return taken
 
     def health(self, time_s: float) -> dict[str, str]:
         """Return ``fresh``, ``not finite`` or ``lost`` by stream."""
@@ -427,6 +473,6 @@ class StreamHealth:
 
     def last(self, stream: str, channels: Sequence[str]) -> Array:
         """Return the last values of some channels; NaN where there is none."""
-        values = self._values.get(stream)
-        known = {} if values is None else dict(zip(self._channels[stream], values, strict=True))
+        names, values = self._channels.get(stream, ()), self._values.get(stream, ())
+        known = dict(zip(names, values, strict=False))
         return np.array([known.get(name, math.nan) for name in channels])

@@ -177,10 +177,11 @@ def model_and_noise(
 ) -> tuple[FilterModel, Noise]:
     """Return the filter for a corrected run, and the noise that it starts from; errors as :func:`estimate_run`."""
     check_corrected(robot)
-    suitable = [each for each in FILTERS_OF_DRIVE[robot.drive] if not robot.filters or each in robot.filters]
-    if name in FILTERS and name not in suitable:
+    of_drive, chosen = FILTERS_OF_DRIVE[robot.drive], robot.filters
+    if name in FILTERS and (name not in of_drive or (chosen and name not in chosen)):
         from terrain.estimation.models.choice import observers_of  # has kernels that filters do not need
 
+        suitable = [each for each in of_drive if not chosen or each in chosen]
         fits = ", ".join((*suitable, *observers_of(robot))) or "pose"
         raise ConfigError(
             f"filter {name!r} is not for robot {robot.name}, whose drive is {robot.drive}: use {fits}"
@@ -231,9 +232,13 @@ def with_tracks(
 
     ``columns`` (n,) by name; those without any finite value are left out of ``state``.
     """
-    run = with_wheel_speeds(run, robot)
-    known = {name: column for name, column in columns.items() if np.isfinite(column).any()}
-    moves = {name: columns[name] for name in ESTIMATOR_CHANNELS if name in columns}
+    run, moves, known = with_wheel_speeds(run, robot), {}, {}
+    for channel in ESTIMATOR_CHANNELS:
+        if channel in columns:
+            moves[channel] = columns[channel]
+    for channel, column in columns.items():
+        if np.isfinite(column).any():
+            known[channel] = column
     streams = dict(run.streams)
     if moves:
         streams["estimator"] = Stream(time_s, np.column_stack(list(moves.values())), tuple(moves))
@@ -280,15 +285,23 @@ def summarize(estimate: Estimate) -> EstimateSummary:
     steps_s = np.diff(track.time_s, append=track.time_s[-1:])
     mean_nees = speed_rmse_mps = math.nan
     if truth is not None:
-        judged = [state.startswith(JUDGED_STATES) for state in track.states]
-        names = [state for state in track.states if state.startswith(JUDGED_STATES)]
+        judged = [k for k, state in enumerate(track.states) if state.startswith(JUDGED_STATES)]
+        names = np.array(track.states)[judged].tolist()
         mean_nees = known_mean(nees(track, truth[:, judged], names)) / len(names)
         speeds = np.isin(track.states, ("speed_x_mps", "speed_y_mps"))
         speed_rmse_mps = math.sqrt(known_mean((track.mean - truth)[:, speeds] ** 2) * speeds.sum())
-    dof = np.where(used, track.nis_dof, 0).sum(axis=0)
-    squares = np.nansum(np.where(used, track.nis, 0.0), axis=0)
-    report = consistency_report(track, truth)
+    nis: dict[str, float] = {}
+    consistency: dict[str, dict[str, str]] = {"sensors": {}, "states": {}}
+    for k, sensor in enumerate(track.sensors):
+        if dof := int(track.nis_dof[used[:, k], k].sum()):
+            nis[sensor] = float(np.nansum(track.nis[used[:, k], k]) / dof)
+    for kind, entries in consistency_report(track, truth)._asdict().items():
+        for entry in entries:
+            consistency[kind][entry.name] = entry.verdict
     dropped = {**estimate.table.dropped, **track.dropped}
+    n_dropped = sum(dropped.values())
+    for kind, n in track.dropped.items():
+        n_dropped -= n if kind.endswith(" gated") else 0
     return EstimateSummary(
         run_id=estimate.run.run_id,
         filter=estimate.name,
@@ -299,14 +312,11 @@ def summarize(estimate: Estimate) -> EstimateSummary:
         slip_peak=figures.peak,
         steady_s=float(steps_s[figures.steady].sum()),
         stale_s=float(steps_s[slip.stale].sum()),
-        nis={name: float(squares[k] / dof[k]) for k, name in enumerate(track.sensors) if dof[k]},
+        nis=nis,
         nees=mean_nees,
-        consistency={
-            "sensors": {entry.name: entry.verdict for entry in report.sensors},
-            "states": {entry.name: entry.verdict for entry in report.states},
-        },
+        consistency=consistency,
         speed_rmse_mps=speed_rmse_mps,
-        n_dropped=sum(n for kind, n in dropped.items() if not kind.endswith(" gated")),
+        n_dropped=n_dropped,
         n_gated=int((track.use == GATED).sum()),
         dropped=dropped,
         finite=bool(np.isfinite(track.mean).all() and np.isfinite(track.cov).all()),

@@ -45,11 +45,9 @@ from __future__ import annotations
 
 import cmath
 import math
-from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,7 +55,6 @@ import numpy as np
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.clocks import REWIND_S
 from terrain.kernels import filled, inner, njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import QUATERNION_TOLERANCE
@@ -300,8 +297,12 @@ def feed_settings(
         initial_yaw_rad=initial_yaw_rad,
         steering_zeros_rad=(*robot.steering_zeros_rad, 0.0, 0.0, 0.0)[:3],
         gyro_bias_radps=sensors.gyro_bias_z_radps,
-        accel_bias_mps2=[getattr(sensors, f"accel_bias_{axis}_mps2") for axis in "xyz"],
-        accel_scale_ratio=[getattr(sensors, f"accel_scale_{axis}_ratio") for axis in "xyz"],
+        accel_bias_mps2=(sensors.accel_bias_x_mps2, sensors.accel_bias_y_mps2, sensors.accel_bias_z_mps2),
+        accel_scale_ratio=(
+            sensors.accel_scale_x_ratio,
+            sensors.accel_scale_y_ratio,
+            sensors.accel_scale_z_ratio,
+        ),
         **options,
     )
     lag_s = robot.encoder_lag_s if time_constant_s is None else time_constant_s
@@ -842,14 +843,15 @@ def measurement_table(
     if robot.steered:
         robot.require("motors", "steering", "sensors", *(["camera"] if "odometry" in run.streams else []))
     streams, dropped = clean_streams(run, robot)
-    clock, wheels = (np.array(part) for part in (streams["wheels"].time_s, streams["wheels"].values))
-    stamps, samples = [], []
+    clock, wheels = np.array(streams["wheels"].time_s), np.array(streams["wheels"].values)
+    period_s, stamps, samples, are_whole = {"wheels": median_step_s(clock)}, [], [], []
     for name, channels in STREAMS.items():
-        stream = streams.get(name)
-        stamps.append(np.empty(0) if stream is None else np.array(stream.time_s))
-        samples.append(np.empty((0, len(channels))) if stream is None else np.array(stream.values))
-    are_whole = tuple(np.ones(times.size, np.bool_) for times in stamps)
-    period_s = {name: median_step_s(stream.time_s) for name, stream in streams.items()}
+        stream = streams.get(name, Stream(np.empty(0), np.empty((0, len(channels))), channels))
+        period_s[name] = median_step_s(stream.time_s)
+        stamps.append(np.array(stream.time_s))
+        samples.append(np.array(stream.values))
+        are_whole.append(np.ones(len(stream), np.bool_))
+    came = tuple(stamps), tuple(samples), tuple(are_whole)
     options = {"is_causal": causal, "ema_alpha": ema_alpha or 0.0}
     settings = feed_settings(robot, period_s, initial_yaw_rad, gnss_latency_s, time_constant_s, **options)
     feed, rows = new_feed(), np.empty((clock.size, N_NUMBERS))
@@ -860,13 +862,13 @@ def measurement_table(
             if known.any():
                 feed["gnss_origin_m"] = samples[GNSS][(fixed if fixed.any() else known).argmax(), :2]
         ahead = feed.copy()
-        run_feed(clock, wheels, tuple(stamps), tuple(samples), are_whole, settings, ahead, rows)
+        run_feed(clock, wheels, *came, settings, ahead, rows)
         feed["yaw_sum_rad"], feed["n_yaw"], feed["has_moved"] = ahead["yaw_sum_rad"], ahead["n_yaw"], True
-    run_feed(clock, wheels, tuple(stamps), tuple(samples), are_whole, settings, feed, rows)
+    run_feed(clock, wheels, *came, settings, feed, rows)
     dropped["wheels: beyond the motors"] = int(feed["wheels_beyond"][0])
     dropped += counts_of(feed, streams)
     names = ROWS_OF_DRIVE[robot.drive]
-    z = rows[:, [ROWS.index(name) for name in names]]
+    z = rows[:, list(map(ROWS.index, names))]
     return MeasurementTable(clock, names, z, rows[:, len(ROWS) :].copy(), dict(+dropped))
 
 
@@ -891,7 +893,6 @@ def clean_streams(run: RunLog, robot: Robot) -> tuple[dict[str, Stream], Counter
     if "wheels" not in run.streams:
         raise DataError(f"{place}there is no stream 'wheels', which gives the clock")
     read: dict[str, Sequence[str]] = {"wheels": robot.rate_channels, **STREAMS}
-    read["steering"] = [f"angle_{wheel}_rad" for wheel in robot.wheels]
     lacks = {"steering": not robot.describes("steering"), "odometry": not robot.describes("camera")}
     clock_s = run.streams["wheels"].time_s[np.isfinite(run.streams["wheels"].time_s)]
     for name, channels in read.items():
@@ -940,84 +941,9 @@ def median_step_s(time_s: Array) -> float:
     return float(np.median(np.diff(time_s))) if time_s.size > 1 else math.nan
 
 
-#: Samples of a stream that wait for the wheels; five seconds of a camera.
-QUEUE = 1024
-CLOCK_SET_S = 1.0  #: Samples that are so far behind, many in a row, are of a clock that was set back.
-Due = list[tuple[float, bool, Array]]
-"""Of samples their stamp, whether all of their numbers are finite, and those, NaN where they are not."""
-
-
 def places_among(names: Sequence[str], among: Sequence[str]) -> Array:
     """Return the place of each name among others, -1 where it is not there."""
     return np.array([list(among).index(name) if name in among else -1 for name in names])
-
-
-def check_channels(stream: str, names: Iterable[str], known: Sequence[str]) -> None:
-    """Raise ``ConfigError`` where a stream that is read sample by sample lacks a channel."""
-    for name in names:
-        if name not in known:
-            raise ConfigError(f"channels of {stream!r} are {list(known)}: {name!r} must be among them")
-
-
-class SampleQueue:
-    """Samples of a stream that wait for the wheels, in order of their stamps: late ones go where they belong.
-
-    Of two of which one is further ahead than any is late, one has a wrong stamp, and goes.
-
-    Attributes
-    ----------
-    waiting : samples that are not due
-    taken_s : stamp of the last one that was taken out
-    n_behind : samples in a row that are stamped long before that one
-    counts : of samples left out, by kind
-    """
-
-    def __init__(self, columns: Array) -> None:
-        """``columns`` say where each channel stands in the readings, -1 where it does not."""
-        self._columns, self._is_lacking = columns, columns < 0
-        self.waiting: Due = []
-        self.taken_s, self.n_behind = -math.inf, 0
-        self.counts: Counter[str] = Counter()
-
-    def push(self, time_s: Array, values: Array) -> None:
-        """Queue samples."""
-        samples = np.ascontiguousarray(values[:, self._columns])  # one layout: one compiled form
-        samples[:, self._is_lacking] = np.nan
-        finite = np.isfinite(samples)
-        samples[~finite] = np.nan
-        finite[:, self._is_lacking] = True
-        waiting, are_whole = self.waiting, np.all(finite, axis=1).tolist()
-        for stamp_s, is_whole, sample in zip(time_s.tolist(), are_whole, samples, strict=True):
-            place = bisect_left(waiting, stamp_s, key=itemgetter(0))
-            is_known = place < len(waiting) and waiting[place][0] == stamp_s
-            if is_known or not self.taken_s < stamp_s < math.inf:
-                self.counts["stamp does not increase"] += 1
-                self.n_behind = self.n_behind + 1 if stamp_s <= self.taken_s - CLOCK_SET_S else 0
-                continue
-            if waiting and waiting[-1][0] - stamp_s > REWIND_S:
-                self.counts["stamp does not increase"] += 1
-                if len(waiting) > 1 and waiting[-2][0] - stamp_s > REWIND_S:
-                    continue
-                waiting.pop()
-            if len(waiting) == QUEUE:
-                self.counts["waited too long"] += QUEUE // 2
-                del waiting[: QUEUE // 2]
-                place = max(place - QUEUE // 2, 0)
-            waiting.insert(place, (stamp_s, is_whole, sample))
-            self.n_behind = 0
-
-    def take(self, time_s: float) -> Due:
-        """Take out what came by a tick; what is stamped far ahead of it goes."""
-        waiting = self.waiting
-        n = next((k for k, (stamp_s, _, _) in enumerate(waiting) if stamp_s > time_s + TICK_S), len(waiting))
-        due = waiting[:n]
-        del waiting[:n]
-        if due:
-            self.taken_s = due[-1][0]
-        while waiting and waiting[-1][0] > time_s + OFF_CLOCK_S:
-            self.counts["off the clock"] += 1
-            waiting.pop()
-        return due
 
 
 def gnss_heading(table: MeasurementTable, robot: Robot) -> float:

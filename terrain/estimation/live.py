@@ -30,26 +30,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.errors import ConfigError
-from terrain.estimation.clocks import NEVER, REWIND_S, readable
-from terrain.estimation.feed import (
-    GNSS_LATENCY_S,
-    GNSS_PERIOD_S,
-    GNSS_ROWS,
-    N_NUMBERS,
-    OFF_CLOCK_S,
-    ROWS,
-    SIDE,
-    STREAMS,
-    TICK_S,
-    SampleQueue,
-    check_channels,
-    counts_of,
-    feed_settings,
-    forget_times,
-    new_feed,
-    places_among,
-    run_feed,
-)
+from terrain.estimation import feed
+from terrain.estimation.clocks import NEVER, REWIND_S, SampleQueue, check_channels, readable
 from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, Filter, FilterSettings
 from terrain.estimation.health import HealthMonitor
 from terrain.estimation.models.choice import OBSERVERS, make_observer
@@ -71,7 +53,7 @@ from terrain.robots import Robot
 
 SETTINGS = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)  #: Those of the batch.
 #: Default channels of each stream of a swerve robot.
-CHANNELS: Mapping[str, tuple[str, ...]] = {"wheels": WHEELS_CHANNELS, **STREAMS}
+CHANNELS: Mapping[str, tuple[str, ...]] = {"wheels": WHEELS_CHANNELS, **feed.STREAMS}
 #: States that are of a sensor, and stay what they are while the robot does anything.
 BIASES = ("gyro_bias_radps", "accel_bias_x_mps2", "accel_bias_y_mps2")
 N_TICKS = 64  #: Most ticks that are remembered; at 200 Hz a little more than :data:`REWIND_S`.
@@ -82,7 +64,8 @@ _JUST_BEFORE_S = 1e-6
 _MOTION = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
 #: A block of samples of each stream where none came.
 _NOTHING = {
-    name: (np.empty(0), np.empty(0, np.bool_), np.empty((0, len(names)))) for name, names in STREAMS.items()
+    name: (np.empty(0), np.empty(0, np.bool_), np.empty((0, len(names))))
+    for name, names in feed.STREAMS.items()
 }
 
 
@@ -217,9 +200,9 @@ class Live(ABC):
                 continue
             stamps = reading.time_s.tolist()
             came[name] = stamps, reading
-            if stamps[-1] <= last_s + OFF_CLOCK_S or last_s == -math.inf:  # else its clock jumped
+            if stamps[-1] <= last_s + feed.OFF_CLOCK_S or last_s == -math.inf:  # else its clock jumped
                 self._newest_s[name] = max(stamps[-1], self._newest_s.get(name, -math.inf))
-            is_late = min(stamps) <= last_s + TICK_S
+            is_late = min(stamps) <= last_s + feed.TICK_S
             if name == "wheels":
                 ticks = [Tick(*tick) for tick in zip(stamps, reading.values, strict=True)]
                 known = (tick.time_s for tick, _ in reversed(self._ticks) if tick.wheels is not None)
@@ -276,7 +259,7 @@ class Live(ABC):
                 reached_s = min(reached_s, newest_s)
         reached_s = math.inf if all_of_them else max(reached_s, last_s - REWIND_S)
         settled = []
-        while self._unsettled and self._unsettled[0].time_s <= reached_s + TICK_S:
+        while self._unsettled and self._unsettled[0].time_s <= reached_s + feed.TICK_S:
             settled.append(self._unsettled.popleft())
             self._settled_s = settled[-1].time_s
         return settled
@@ -305,11 +288,11 @@ class Live(ABC):
         last_s = self._last_s
         known = {stamp_s for _, came in self._came if name in came for stamp_s in came[name][0]}
         late_s = min(
-            (at_s for at_s in stamps if at_s <= last_s + TICK_S and at_s not in known), default=math.inf
+            (at_s for at_s in stamps if at_s <= last_s + feed.TICK_S and at_s not in known), default=math.inf
         )
         if late_s == math.inf:
             return math.inf
-        if not late_s - TICK_S > max(self._ticks[0][0].time_s, last_s - REWIND_S):
+        if not late_s - feed.TICK_S > max(self._ticks[0][0].time_s, last_s - REWIND_S):
             self.too_late = last_s, last_s - late_s
             return math.inf
         self._counted["came late"] += 1
@@ -319,7 +302,7 @@ class Live(ABC):
         """Put the memory back before an instant; return the ticks to be done again, with new ones."""
         done = [] if self._leapt is None else [self._leapt]
         self._leapt = None
-        while self._last_s >= late_s - TICK_S:
+        while self._last_s >= late_s - feed.TICK_S:
             done.append(self._ticks.pop()[0])
         memory, taken_s = self._ticks[-1][1]
         self._restore(memory)
@@ -387,7 +370,7 @@ class LiveFilter(Live):
         channels: Mapping[str, tuple[str, ...]] | None = None,
         *,
         initial_yaw_rad: float | None = None,
-        gnss_latency_s: float = GNSS_LATENCY_S,
+        gnss_latency_s: float = feed.GNSS_LATENCY_S,
         rate_hz: Mapping[str, float] | None = None,
         correction: Correction | None = None,
     ) -> None:
@@ -414,34 +397,38 @@ class LiveFilter(Live):
             Filter(self.model, noise, SETTINGS),
         )
         sensors, camera = robot.completed.sensors, robot.completed.camera
-        rates = {"wheels": sensors.wheels_rate_hz, "imu": sensors.imu_rate_hz, "gnss": 1.0 / GNSS_PERIOD_S}
+        rates = {
+            "wheels": sensors.wheels_rate_hz,
+            "imu": sensors.imu_rate_hz,
+            "gnss": 1.0 / feed.GNSS_PERIOD_S,
+        }
         rates |= {"steering": sensors.steering_rate_hz, "odometry": camera.rate_hz, **(rate_hz or {})}
         period_s = {stream: 1.0 / rate for stream, rate in rates.items() if rate > 0.0}
         arriving = {"is_causal": True, "is_live": True}
-        self._settings = feed_settings(robot, period_s, yaw_rad, gnss_latency_s, **arriving)
-        self._feed, self._rows = new_feed(), np.full((1, N_NUMBERS), np.nan)
-        self._schedule = Schedule(self.model, ROWS) if self.model.inputs else None
+        self._settings = feed.feed_settings(robot, period_s, yaw_rad, gnss_latency_s, **arriving)
+        self._feed, self._rows = feed.new_feed(), np.full((1, feed.N_NUMBERS), np.nan)
+        self._schedule = Schedule(self.model, feed.ROWS) if self.model.inputs else None
         self._monitor = None if self._skids else HealthMonitor(robot, self.model)
         self._slip, self._region = SlipOfInstant(robot, self.states), RegionMonitor(robot)
         self._motion = motion_memory()
         memories = [self.filter.state, self._feed, self._motion]
         memories += [] if self._monitor is None else [self._monitor.memory]
         self._memories = [memory.view(np.uint8) for memory in memories]  # bytes are copied at once
-        self._row_places = [ROWS.index(row) for row in self.model.rows]
-        self._gnss_places = [k for k, row in enumerate(self.model.rows) if row in GNSS_ROWS]
+        self._row_places = [feed.ROWS.index(row) for row in self.model.rows]
+        self._gnss_places = [k for k, row in enumerate(self.model.rows) if row in feed.GNSS_ROWS]
         motion = ("speed_mps", "", "yaw_rate_radps", "", "") if self._skids else _MOTION
-        self._motion_places = places_among(motion, self.states).tolist()
+        self._motion_places = feed.places_among(motion, self.states).tolist()
         check_channels("wheels", robot.rate_channels, channels.get("wheels", ()))
         if self._skids and channels.get("imu"):
             check_channels("imu", ("gyro_z_radps",), channels["imu"])
         has = {"gnss": has_gnss, "odometry": robot.describes("camera")}
         queues = {
-            name: SampleQueue(places_among(STREAMS[name], channels[name]))
-            for name in (("imu",) if self._skids else STREAMS)
+            name: SampleQueue(feed.places_among(feed.STREAMS[name], channels[name]))
+            for name in (("imu",) if self._skids else feed.STREAMS)
             if channels.get(name) and has.get(name, True)
         }
-        self._rate_columns = places_among(robot.rate_channels, channels["wheels"])
-        self._current_columns = places_among(
+        self._rate_columns = feed.places_among(robot.rate_channels, channels["wheels"])
+        self._current_columns = feed.places_among(
             [f"current_{wheel}_a" for wheel in robot.wheels], channels["wheels"]
         )
         super().__init__(channels, queues, period_s["wheels"], correction)
@@ -449,7 +436,7 @@ class LiveFilter(Live):
     @property
     def dropped(self) -> dict[str, int]:
         """What was not taken so far, as counts by stream and kind, and by what the filter did not believe."""
-        counts = super().dropped | self.filter.dropped | counts_of(self._feed, self._queues)
+        counts = super().dropped | self.filter.dropped | feed.counts_of(self._feed, self._queues)
         counts["wheels: not finite"] = int(self._feed["wheels_not_finite"][0])
         counts["wheels: beyond the motors"] = int(self._feed["wheels_beyond"][0])
         return {kind: n for kind, n in counts.items() if n}
@@ -481,7 +468,7 @@ class LiveFilter(Live):
         return follows
 
     def _forget(self) -> None:
-        forget_times(self._feed)
+        feed.forget_times(self._feed)
 
     def _snapshot(self) -> list[Array]:
         return [memory.copy() for memory in self._memories]
@@ -502,7 +489,7 @@ class LiveFilter(Live):
         rates[unknown] = np.nan
         self._feed["wheels_not_finite"] += tick.wheels is not None and unknown.any()
         clock = np.array([tick.time_s])
-        run_feed(clock, rates[None], stamps, samples, are_whole, self._settings, self._feed, self._rows)
+        feed.run_feed(clock, rates[None], stamps, samples, are_whole, self._settings, self._feed, self._rows)
         return rates
 
     def _estimate(self, tick: Tick, leapt: Tick | None) -> LiveEstimate:
@@ -512,10 +499,10 @@ class LiveFilter(Live):
         rates, wheels = self._measure(tick), self._no_wheels if tick.wheels is None else tick.wheels
         variance, walk, inputs = filter_.noise.measurement_variance, None, None
         if self._schedule is not None:
-            (variance,), (walk,), (inputs,) = self._schedule(self._rows[:, : len(ROWS)], variance)
+            (variance,), (walk,), (inputs,) = self._schedule(self._rows[:, : len(feed.ROWS)], variance)
         if self._gnss_places:
             variance = np.array(variance)
-            variance[self._gnss_places] = row[len(ROWS) :]
+            variance[self._gnss_places] = row[len(feed.ROWS) :]
         filter_.step(time_s, row[self._row_places], variance, walk, inputs)
         if self._monitor is not None:
             self._monitor.judge(time_s, wheels, rates, self._rows, self._feed, filter_.state)
@@ -525,8 +512,8 @@ class LiveFilter(Live):
         wheel_speed_mps = rates
         if self._skids:  # nothing sees the ground go by: slip is not known
             mean = within_bounds(mean, robot.track_m)
-            left_mps, right_mps = row[SIDE : SIDE + 2].tolist()
-            has_gyro = not math.isnan(row[ROWS.index("gyro_z_radps")])
+            left_mps, right_mps = row[feed.SIDE : feed.SIDE + 2].tolist()
+            has_gyro = not math.isnan(row[feed.ROWS.index("gyro_z_radps")])
             yaw_rate, bias = (self.states.index(name) for name in ("yaw_rate_radps", "gyro_bias_radps"))
             known = float(mean[yaw_rate]), float(std[bias]), robot.track_m
             motion = motion_at(time_s, left_mps, right_mps, has_gyro, *known, self._motion)
@@ -545,7 +532,7 @@ class LiveFilter(Live):
             slip_std,
             age_s > STALE_AFTER_S,
             age_s,
-            row[: len(ROWS)].copy(),
+            row[: len(feed.ROWS)].copy(),
             v_x,
             v_y,
             turn,

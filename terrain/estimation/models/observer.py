@@ -25,14 +25,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.errors import DataError
-from terrain.estimation.feed import (
-    CLOCK_SET_S,
-    TICK_S,
-    Due,
-    SampleQueue,
-    check_channels,
-    places_among,
-)
+from terrain.estimation.clocks import CLOCK_SET_S, Due, SampleQueue, check_channels
+from terrain.estimation.feed import TICK_S, places_among
 from terrain.estimation.filter import Filter, FilterModel, FilterSettings, Noise
 from terrain.records import GATED, REOPENED, USED, Array, RunLog
 from terrain.robots import Robot

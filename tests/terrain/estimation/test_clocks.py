@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from terrain.estimation.clocks import AHEAD_S, N_AGREED, PERIOD_S, Clocks, StreamHealth
+from terrain.estimation.clocks import AHEAD_S, N_AGREED, PERIOD_S, Clocks, Inbox
 from terrain.estimation.live import REWIND_S
 from terrain.records import Reading
 
@@ -163,9 +163,11 @@ def test_a_time_that_is_none_passes_a_period(bad):
 
 
 def test_a_stream_that_ended_before_the_clock_was_set_back_is_lost():
-    health = StreamHealth({"imu": ("gyro_z_radps",), "wheels": ("speed_left_mps",)})
-    reading = Reading(np.array([0.0]), np.array([[0.1]]))
-    health.take({"imu": reading, "wheels": reading}, 5000.0)
+    inbox = Inbox({"imu": ("gyro_z_radps",), "wheels": ("speed_left_mps",)})
+    for stream in ("imu", "wheels"):
+        inbox.put(stream, [0.0], [[0.1]])
+    inbox.take(5000.0)
     for k in range(20):
-        health.take({"imu": reading}, 1000.0 + 0.1 * k)
-    assert health.health(1002.0) == {"imu": "fresh", "wheels": "lost"}
+        inbox.put("imu", [0.0], [[0.1]])
+        inbox.take(1000.0 + 0.1 * k)
+    assert inbox.health(1002.0) == {"imu": "fresh", "wheels": "lost"}

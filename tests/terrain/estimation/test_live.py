@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from terrain.errors import ConfigError
+from terrain.estimation.clocks import QUEUE
 from terrain.estimation.estimate import estimate_run
-from terrain.estimation.feed import GNSS_ROWS, QUEUE, ROWS, measurement_table
+from terrain.estimation.feed import GNSS_ROWS, ROWS, measurement_table
 from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, FilterSettings, Noise, run_filter
 from terrain.estimation.live import CHANNELS, LiveFilter, LiveObserver
 from terrain.estimation.models.choice import OBSERVERS, make_observer

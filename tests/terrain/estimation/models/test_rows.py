@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.feed import QUEUE
+from terrain.estimation.clocks import QUEUE
 from terrain.estimation.live import LiveObserver
 from terrain.estimation.models import observer as observer_rows
 from terrain.estimation.models.observer import (
