@@ -1260,7 +1260,7 @@ def vector_of(values: Mapping[str, float]) -> Array:
 
 
 SCHEMA = 1  #: Version of the section that is read and written.
-#: Keys of the section that name no parameter; the region is read by :mod:`terrain.robots.region`.
+#: Keys of the section that name no parameter; the region is read by :mod:`terrain.robots`.
 NOT_EFFECTS = ("schema", "covariance", "region")
 
 #: A covariance is written with seven digits: correlations may miss symmetry and sign by as much.

@@ -40,8 +40,7 @@ from terrain.errors import ConfigError, OutsideRegionWarning
 from terrain.files.documents import parse_yaml, read_yaml
 from terrain.kinematics.wheels import no_slip_twist
 from terrain.records import Array, RunLog, Stream
-from terrain.robots import BicycleRobot, Region, Robot, description_file, robot_from
-from terrain.robots.region import Range, outside, widened
+from terrain.robots import BicycleRobot, Range, Region, Robot, description_file, outside, robot_from, widened
 
 AnyRobot = TypeVar("AnyRobot", bound=Robot)  #: What is corrected keeps its drive.
 
@@ -171,7 +170,7 @@ def warn_outside(run: RunLog, robot: Robot) -> None:
 
 
 def _warn_of(drive: str, robot: Robot, beyond: str) -> None:
-    """Warn that a drive leaves the region, ``beyond`` as :func:`terrain.robots.region.outside` returns it."""
+    """Warn that a drive leaves the region, ``beyond`` as :func:`terrain.robots.outside` returns it."""
     warnings.warn(
         f"{drive} leaves the region that the effects of robot {robot.name} were validated in: {beyond}",
         OutsideRegionWarning,

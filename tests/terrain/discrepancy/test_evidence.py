@@ -98,7 +98,7 @@ def test_a_nuisance_is_a_parameter_too_and_its_scatter_widens_its_variance(info,
     name = ["rolling_resistance_ratio"]  # which scatters
     wide, narrow = fit_change(info, name)[1][0, 0], fit_change(firm, name)[1][0, 0]
     # the mean over runs cannot be better known than its scatter lets
-    assert wide > SCATTER["rolling_resistance_ratio"]**2 / len(info.rows) > narrow
+    assert wide > SCATTER["rolling_resistance_ratio"] ** 2 / len(info.rows) > narrow
     assert firm.nuisances.size == 0
     here = steady.near(firm, info.vector, NAMES)
     scale = np.sqrt(here.a.diagonal())

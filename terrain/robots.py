@@ -1,4 +1,33 @@
-"""Robots: the sections of their descriptions, what all drives share, and what each kind of drive is."""
+"""Robots: the sections of their descriptions, what each drive is, and the reader of descriptions.
+
+Each number of a description carries its unit and its source, ``source: assumed`` where there is none, and,
+where it was calibrated, its 95 % interval::
+
+    name: agrimaro
+    drive: swerve
+    wheel_radius_m: {value: 0.2, unit: m, source: assumed}
+    sensors:
+      gyro_bias_z_radps: {value: 0.0021, unit: radps, source: "terrain calibrate", interval: [0.0019, 0.0023]}
+
+Geometry and mass are required of every robot; the sections ``body``, ``motors``, ``steering``, ``camera`` and
+``sensors`` by what simulates a robot or filters its log.  The section ``identified`` keeps what logs of one
+robot showed beside its nominal figures: its effective track, the radius that its wheels roll on, delays.  The
+list ``filters`` names the filters and observers that apply, where not all of its drive do.  The section
+``effects`` of an extended robot (:mod:`terrain.effects`) says what else acts; :mod:`terrain.extension` makes
+use of it.
+
+**The region of driving** that an extended robot was validated in is part of the section ``effects``; a range that was
+not measured is left out::
+
+    effects:
+      schema: 1
+      ...
+      region:
+        wheel_speed_mps: [-0.82, 1.04]
+        yaw_rate_radps: [-0.9, 0.93]
+        grade_rad: [-0.05, 0.08]
+        terrains: [asphalt, grass]
+"""
 
 from __future__ import annotations
 
@@ -7,14 +36,123 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, NamedTuple, Self, TypeAlias, TypeVar
+from typing import Annotated, Any, ClassVar, NamedTuple, Self, TypeAlias, TypeVar, get_type_hints
 
 import numpy as np
 
+from terrain.effects import read_effects
 from terrain.errors import ConfigError
+from terrain.files.documents import check_keys, number, read_yaml
+from terrain.files.names import check_name, data_folder, shown
 from terrain.records import Array, read_only
-from terrain.robots.region import Region
+
+MARGIN = 0.1
+"""Part of a range's width that a run may go beyond it: its ends are percentiles, which runs of the same kind
+miss by that much."""
+
+LEAST_MARGIN = {"wheel_speed_mps": 0.05, "yaw_rate_radps": 0.05, "grade_rad": 0.02}
+"""Margin of a narrow range: what a logger's noise and an uneven floor make of driving that is the same."""
+
+WORDS = {"wheel_speed_mps": "wheel speed", "yaw_rate_radps": "yaw rate by the wheels", "grade_rad": "slope"}
+"""Each range in words."""
+
+Range = tuple[float, float]
+
+
+class Region(NamedTuple):
+    """Ranges, 1st to 99th percentile, of the runs that effects were found on.
+
+    A range is None where it was not measured, and so is what goes beyond it.
+    """
+
+    wheel_speed_mps: Range | None  #: mean circumferential speed of the wheels, forward positive
+    yaw_rate_radps: Range | None  #: that the wheels would turn the robot with, without slip
+    grade_rad: Range | None  #: measured slope, uphill positive
+    terrains: tuple[str, ...]  #: labels of the runs
+
+
+def outside(region: Region, driven: Region) -> str:
+    """Return where a drive goes beyond a region, in words; empty where it does not.
+
+    Parameters
+    ----------
+    region : that was validated
+    driven : ranges and terrains of the drive
+
+    Examples
+    --------
+    >>> validated = Region((-0.5, 1.0), None, None, ("grass",))
+    >>> outside(validated, Region((0.0, 1.8), (-1.0, 1.0), None, ("snow",)))
+    "wheel speed 0 to 1.8 m/s (validated: -0.5 to 1), terrain 'snow' (validated: grass)"
+    >>> outside(validated, Region((0.0, 1.1), None, None, ()))
+    ''
+    """
+    found = []
+    for name, words in WORDS.items():
+        known, now = getattr(region, name), getattr(driven, name)
+        if known is None or now is None:
+            continue
+        low, high = widened(name, known)
+        if now[0] < low or now[1] > high:
+            unit = name.rpartition("_")[2].replace("ps", "/s")
+            found.append(
+                f"{words} {now[0]:.2g} to {now[1]:.2g} {unit} (validated: {known[0]:.2g} to {known[1]:.2g})"
+            )
+    new = [terrain for terrain in driven.terrains if terrain not in region.terrains]
+    if new and region.terrains:
+        names = ", ".join(repr(terrain) for terrain in new)
+        found.append(f"terrain {names} (validated: {', '.join(region.terrains)})")
+    return ", ".join(found)
+
+
+def widened(name: str, known: Range) -> Range:
+    """Return a range of a region with its margin: what goes beyond that is outside.
+
+    Examples
+    --------
+    >>> widened("wheel_speed_mps", (-1.0, 1.0))
+    (-1.2, 1.2)
+    """
+    margin = max(MARGIN * (known[1] - known[0]), LEAST_MARGIN[name])
+    return known[0] - margin, known[1] + margin
+
+
+def read_region(place: str, described: Any) -> Region:
+    """Return the region that a description states.
+
+    Raises
+    ------
+    ConfigError
+        if a key is unknown, a range is not two rising finite numbers, or the terrains are no list of words.
+
+    Examples
+    --------
+    >>> read_region("mine.yaml: region", {"grade_rad": [0.0, 0.1]})
+    Region(wheel_speed_mps=None, yaw_rate_radps=None, grade_rad=(0.0, 0.1), terrains=())
+    """
+    check_keys(place, described, [], optional=Region._fields)
+    terrains = described.get("terrains", [])
+    if not isinstance(terrains, list) or not all(isinstance(name, str) and name for name in terrains):
+        raise ConfigError(f"{place}: terrains is {terrains!r}, a list of words is required")
+    ranges: dict[str, Range | None] = dict.fromkeys(WORDS)
+    for name in WORDS:
+        edges = described.get(name)
+        if edges is None:
+            continue
+        if not isinstance(edges, list) or len(edges) != 2 or not all(map(_is_finite, edges)):
+            raise ConfigError(f"{place}: {name} is {edges!r}, two finite numbers are required")
+        low, high = float(edges[0]), float(edges[1])
+        if low > high:
+            raise ConfigError(f"{place}: {name} is {edges!r}, the lower edge comes first")
+        ranges[name] = low, high
+    return Region(**ranges, terrains=tuple(terrains))
+
+
+def _is_finite(edge: Any) -> bool:
+    return isinstance(edge, int | float) and not isinstance(edge, bool) and math.isfinite(edge)
+
 
 Signed = Annotated[float, -math.inf]
 """A number of a description that may have any value; a plain ``float`` has to be above zero."""
@@ -192,9 +330,8 @@ class Robot(ABC):
     track_m: float
     wheelbase_m: float  #: distance between front and rear wheel
     mass_kg: float  #: total mass without payload
-    parts: Mapping[str, Part] = field(
-        default_factory=dict, hash=False
-    )  #: sections of the description by name
+    #: sections of the description by name
+    parts: Mapping[str, Part] = field(default_factory=dict, hash=False)
     #: parameters of :mod:`terrain.effects` that are not 0, by name
     effects: Mapping[str, float] = field(default_factory=dict, hash=False)
     #: (n, n) covariance of the effects in their order; NaN where unknown
@@ -460,10 +597,8 @@ class SkidSteerRobot(Robot):
     @cached_property
     def wheel_table(self) -> tuple[Wheel, ...]:
         """Middle of each side."""
-        return tuple(
-            Wheel(side, 0.0, y_m, f"speed_{side}_mps")
-            for side, y_m in (("left", self.track_m / 2), ("right", -self.track_m / 2))
-        )
+        left = Wheel("left", 0.0, self.track_m / 2, "speed_left_mps")
+        return left, Wheel("right", 0.0, -self.track_m / 2, "speed_right_mps")
 
 
 @dataclass(frozen=True)
@@ -479,9 +614,7 @@ class TrackedRobot(SkidSteerRobot):
     numbers: ClassVar[tuple[str, ...]] = (
         *("sprocket_radius_m", "track_m", "contact_length_m", "track_width_m", "com_height_m", "mass_kg"),
     )
-    spelled: ClassVar[Mapping[str, str]] = MappingProxyType(
-        {"wheel_radius_m": "sprocket_radius_m", "wheelbase_m": "contact_length_m"}
-    )
+    spelled = MappingProxyType({"wheel_radius_m": "sprocket_radius_m", "wheelbase_m": "contact_length_m"})
     drive: ClassVar[str] = "tracked"
     n_tyres: ClassVar[int] = 2
 
@@ -596,11 +729,16 @@ class OmniRobot(Robot):
     def wheel_table(self) -> tuple[Wheel, ...]:
         """Three wheels, each driving counter-clockwise about the origin."""
         places = (self.first_wheel_rad + 2.0 * np.pi / 3.0 * np.arange(3)).tolist()
-        d = self.wheel_distance_m
+        d, cos, sin = self.wheel_distance_m, np.cos, np.sin
         return tuple(
             Wheel(
-                *(f"{k}", d * float(np.cos(at)), d * float(np.sin(at)), f"motor_{k}_radps", at + np.pi / 2),
-                rolls_across=True,
+                f"{k}",
+                d * float(cos(at)),
+                d * float(sin(at)),
+                f"motor_{k}_radps",
+                at + np.pi / 2,
+                False,
+                True,
             )
             for k, at in enumerate(places, 1)
         )
@@ -642,9 +780,8 @@ class BicycleRobot(Robot):
 
     numbers: ClassVar[tuple[str, ...]] = (
         *Robot.numbers,
-        *("com_ahead_m", "com_height_m", "yaw_inertia_kgm2", "steering_max_rad"),
-        *("steering_time_constant_s", "steering_rate_radps", "speed_max_mps"),
-        *("front_cornering_npr", "rear_cornering_npr"),
+        *["com_ahead_m", "com_height_m", "yaw_inertia_kgm2", "steering_max_rad", "steering_time_constant_s"],
+        *["steering_rate_radps", "speed_max_mps", "front_cornering_npr", "rear_cornering_npr"],
     )
     drive: ClassVar[str] = "bicycle"
     sections: ClassVar[tuple[str, ...]] = ("sensors",)
@@ -709,3 +846,157 @@ def as_drive(kind: type[_R], robot: Robot, refusal: str) -> _R:
     if not isinstance(robot, kind):
         raise ConfigError(refusal.format(name=robot.name, drive=robot.drive))
     return robot
+
+
+KIND_OF_DRIVE: dict[str, type[Robot]] = {
+    kind.drive: kind for kind in (SkidSteerRobot, TrackedRobot, SwerveRobot, OmniRobot, BicycleRobot)
+}
+"""The type of each drive."""
+
+IDENTIFIED: Mapping[str, float | None] = {
+    "rolling_radius_m": None,
+    "effective_track_m": None,
+    "lidar_delay_s": -math.inf,
+    "wheels_delay_s": -math.inf,
+    "wheel_distance_m": None,
+}
+"""Numbers of the section ``identified``, which logs of one robot showed and no nominal figure is: the least
+value of each, None for above zero (:mod:`terrain.calibration.skid_steer`,
+:mod:`terrain.calibration.omni`)."""
+
+
+def load_robot(name_or_path: str | Path) -> Robot:
+    """Return a robot of the package, by name, or the one that a YAML file describes.
+
+    Parameters
+    ----------
+    name_or_path : ``agrimaro``, ``husky``, or the path of a file that ends in ``.yaml`` or ``.yml``
+
+    Raises
+    ------
+    ConfigError
+        if there is no such robot, a key is unknown or missing, a unit is not the field's own, a source is
+        missing, a number is out of its range, or the geometry is impossible.
+
+    Examples
+    --------
+    >>> load_robot("husky").track_m
+    0.5708
+    """
+    name = str(name_or_path)
+    if (
+        name not in _READ
+    ):  # one of the package is read once a process: it takes 30 ms, and a robot never changes
+        robot = robot_from(*read_description(name_or_path))
+        if name not in robot_names():
+            return robot
+        _READ[name] = robot
+    return _READ[name]
+
+
+_READ: dict[str, Robot] = {}
+
+
+def read_description(name_or_path: str | Path) -> tuple[str, Any]:
+    """Return the file name and the YAML content of a robot's description, unchecked."""
+    path = description_file(name_or_path)
+    return path.name, read_yaml(path)
+
+
+def description_file(name_or_path: str | Path) -> Path:
+    """Return the file of a robot's description: the path itself, or that of a robot of the package."""
+    path = Path(name_or_path)
+    if path.suffix in (".yaml", ".yml"):
+        return path
+    known = robot_names()
+    if str(name_or_path) not in known:
+        raise ConfigError(
+            f"robot {shown(str(name_or_path))} is unknown: give one of {', '.join(known)}, or a .yaml file"
+        )
+    return data_folder("robots") / f"{name_or_path}.yaml"
+
+
+def robot_names() -> tuple[str, ...]:
+    """Return the names of the robots that travel with the package."""
+    return tuple(sorted(file.stem for file in data_folder("robots").glob("*.yaml")))
+
+
+def packaged_robot(name: str) -> Robot:
+    """Return a robot of the package by the name that a log gives: a name, never the path of a file.
+
+    Examples
+    --------
+    >>> packaged_robot("husky").drive
+    'skid_steer'
+    >>> packaged_robot("/tmp/husky.yaml")
+    Traceback (most recent call last):
+    terrain.errors.ConfigError: robot '/tmp/husky.yaml' is unknown: a log names one of adap2e, ...
+    """
+    known = robot_names()
+    if name not in known:
+        raise ConfigError(
+            f"robot {shown(name)} is unknown: a log names one of {', '.join(known)}, or the one whose "
+            ".yaml file is given"
+        )
+    return load_robot(name)
+
+
+def robot_named(name: str, given: Robot | None) -> Robot:
+    """Return the robot that a log names: the one that is given, where it bears the name, else the package's."""
+    return given if given is not None and given.name == name else packaged_robot(name)
+
+
+def robot_from(file: str, described: Any) -> Robot:
+    """Return the robot of a description's content; ``file`` is what messages call it."""
+    drive = described.get("drive") if isinstance(described, dict) else None
+    kind = KIND_OF_DRIVE.get(drive, SkidSteerRobot) if isinstance(drive, str) else SkidSteerRobot
+    optional = (*KIND_OF_SECTION, "identified", "filters", "effects")
+    check_keys(file, described, ["name", "drive", *kind.numbers], optional=optional)
+    name = described["name"]
+    if not isinstance(name, str) or not name:
+        raise ConfigError(f"{file}: name is {shown(name)}, a word is required")
+    check_name(f"{file}: name", name, ConfigError)
+    if not isinstance(drive, str) or drive not in KIND_OF_DRIVE:
+        raise ConfigError(f"{file}: drive {shown(drive)} is unknown: use one of {', '.join(KIND_OF_DRIVE)}")
+    numbers = {key: number(f"{file}: {key}", described[key], _unit(key)) for key in kind.numbers}
+    parts = {
+        section: _part(f"{file}: {section}", part, described[section])
+        for section, part in KIND_OF_SECTION.items()
+        if described.get(section) is not None
+    }
+    entries = {key: described[key] for key in kind.numbers}
+    for section in parts:
+        entries |= {f"{section}.{key}": entry for key, entry in described[section].items()}
+    assumed = frozenset(k for k, e in entries.items() if e["source"].strip().lower().startswith("assumed"))
+    shown_by_logs, filters = described.get("identified", {}), described.get("filters", [])
+    check_keys(f"{file}: identified", shown_by_logs, [], optional=tuple(IDENTIFIED))
+    identified = {
+        key: number(f"{file}: identified: {key}", entry, _unit(key), IDENTIFIED[key])
+        for key, entry in shown_by_logs.items()
+    }
+    if not isinstance(filters, list) or not all(isinstance(name, str) and name for name in filters):
+        raise ConfigError(f"{file}: filters is {shown(filters)}, a list of names is required")
+    also = {"parts": parts, "assumed": assumed, "identified": identified, "filters": tuple(filters)}
+    robot = kind.described(name, numbers, **also)
+    if "effects" in described:
+        effects, cov = read_effects(f"{file}: effects", described["effects"], drive)
+        stated = described["effects"].get("region")
+        region = None if stated is None else read_region(f"{file}: effects: region", stated)
+        robot = replace(robot, effects=effects, effects_cov=cov, region=region)
+    robot.check_geometry(file)
+    return robot
+
+
+def _part(place: str, kind: Any, described: Any) -> Any:
+    hints = get_type_hints(kind, include_extras=True)
+    check_keys(place, described, list(hints))
+    return kind(
+        **{
+            key: number(f"{place}: {key}", described[key], _unit(key), *getattr(hint, "__metadata__", ()))
+            for key, hint in hints.items()
+        }
+    )
+
+
+def _unit(key: str) -> str:
+    return key.rpartition("_")[2]
