@@ -283,19 +283,19 @@ def samples_of(
         runs = [run for run in runs if driven_at(run, *speed_mps)]
         if not runs:
             raise DataError(f"no run is driven at a speed of {speed_mps[0]:g} to {speed_mps[1]:g} m/s")
-    distinct = distinct_runs(runs, merge=merge_duplicates)
+    distinct, merged = distinct_runs(runs, merge=merge_duplicates)
     if protocol == "published":
-        cut, group = cut_partitions(distinct.runs, rule, signal_sets)
+        cut, group = cut_partitions(distinct, rule, signal_sets)
         gap = 0
     else:
-        layout = layout_of(distinct.runs, signal_sets, speeds=rule.steady is not None)
-        cut = labelled(cut_windows(distinct.runs, rule, layout=layout, skip_short=skip_short))
+        layout = layout_of(distinct, signal_sets, speeds=rule.steady is not None)
+        cut = labelled(cut_windows(distinct, rule, layout=layout, skip_short=skip_short))
         group, gap = cut.windows.run_id, rule.overlap
     values = cut.windows.values
     if not any((each != each[:1, :, :1]).any() for each in values.values()):
         streams = " and ".join(repr(name) for name in values)
         raise DataError(f"no channel of the streams {streams} ever varies: nothing can be learned from them")
-    return Samples(cut.windows, cut.dropped, group, gap, distinct.merged, distinct.runs, repaired)
+    return Samples(cut.windows, cut.dropped, group, gap, merged, distinct, repaired)
 
 
 def _logs(samples: Samples) -> Sequence[RunLog]:

@@ -104,7 +104,7 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
             figures = slip_figure(example), motion_figure(example)
         else:
             given = load_runs(data)
-        runs = distinct_runs(given, merge=settings.merge_duplicates).runs
+        runs, _ = distinct_runs(given, merge=settings.merge_duplicates)
         dataset = SIMULATED if data is None else data.resolve().name
         training, held_out = hold_out_runs(runs)
         kept = _keep(given, data, out / "runs", progress)

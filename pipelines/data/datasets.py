@@ -45,7 +45,7 @@ FOUND_BY: dict[str, tuple[str, tuple[str, ...]]] = {
         "terrain.logs.robotino:find_runs",
         tuple(f"{'../' * n}camera_params.json" for n in range(4)),
     ),
-    "drive-recording": ("terrain.logs.drive_recording:find_recordings", ("*.csv.gz", "*/*.csv.gz")),
+    "drive-recording": ("terrain.logs.drive:find_recordings", ("*.csv.gz", "*/*.csv.gz")),
     "testbed": ("terrain.logs.testbed:find_runs", ("smooth.csv", "grouser.csv")),
 }
 """What finds the runs of each layout, and patterns of its files: without one of these it is not even imported."""
@@ -247,10 +247,10 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot
 
         return drive.find_runs(folder, drive_robot(robot))
     if "drive-recording" in found:
-        from terrain.logs import drive_recording
+        from terrain.logs import drive
         from terrain.robots import robot_named
 
-        return drive_recording.find_runs(folder, lambda name: drive_robot(robot_named(name, robot)))
+        return drive.find_recorded_runs(folder, lambda name: drive_robot(robot_named(name, robot)))
     return next(iter(found.values()), [])
 
 

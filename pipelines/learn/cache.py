@@ -33,7 +33,7 @@ from terrain import __version__
 from terrain.classify.limits import Motion
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.files.atomic import atomic_file, ensure_writable
-from terrain.logs.duplicates import PrintFiles, RunPrint, run_print, sentences, shared_stretches
+from terrain.logs.duplicates import RunPrint, possible_pairs, run_print, sentences, shared_stretches
 from terrain.logs.run_folders import data_digest, joint_digest
 from terrain.records import Array, RunLog, Stream, Windows
 
@@ -130,11 +130,11 @@ def _heads(
     """Return the head of each run, and the pairs of ids that may hold the same measurements."""
     heads: list[RunHead] = []
     each = [(load,) for load in loaders]
-    with PrintFiles() as prints:
-        for head, codes, time_s in parallel(_head, (place,), each, n_jobs, "channels", progress):
-            heads.append(head)
-            prints.add(RunPrint(codes, time_s, bytes.fromhex(head.print_digest)))
-        pairs = [(heads[a].run_id, heads[b].run_id) for a, b in prints.possible_pairs()]
+    prints = []
+    for head, codes, time_s in parallel(_head, (place,), each, n_jobs, "channels", progress):
+        heads.append(head)
+        prints.append(RunPrint(codes, time_s, bytes.fromhex(head.print_digest)))
+    pairs = [(heads[a].run_id, heads[b].run_id) for a, b in possible_pairs(prints)]
     found = Counter(head.run_id for head in heads if not head.fault)
     if not found:
         raise LogError(f"not one run could be read, the first for this: {heads[0].fault}")

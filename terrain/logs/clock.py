@@ -123,20 +123,13 @@ def yaw_rate_pair(run: RunLog, track_m: float) -> tuple[Pair, float, float] | No
     )
 
 
-def estimate_clock(
-    run: RunLog,
-    *,
-    track_m: float,
-    max_offset_s: float = MAX_OFFSET_S,
-    max_rate: float = MAX_RATE,
-) -> ClockEstimate:
+def estimate_clock(run: RunLog, *, track_m: float) -> ClockEstimate:
     """Estimate offset and rate between the clocks of the streams ``wheels`` and ``imu`` of a run.
 
     Parameters
     ----------
     run : run log with ``imu`` (``gyro_z_radps``) and ``wheels`` (``speed_left_mps``, ``speed_right_mps``)
     track_m : distance of the wheels of the two sides; it scales the gain and what counts as turning
-    max_offset_s, max_rate : bounds of the search, either sign, above zero
 
     Raises
     ------
@@ -174,9 +167,9 @@ def estimate_clock(
     # Where all rates within the bounds move the turns by less than the low-pass smears them, none is tried.
     spread_s = float(np.sqrt(np.average((pair.time_s - centre_s) ** 2, weights=turning)))
     reach_s = float(np.max(np.abs(pair.time_s - centre_s)))
-    for rate_bound in (max_rate, 0.0) if max_rate * spread_s > sigma_s else (0.0,):
+    for rate_bound in (MAX_RATE, 0.0) if MAX_RATE * spread_s > sigma_s else (0.0,):
         n_rates = int(np.ceil(rate_bound * reach_s / sigma_s))
-        furthest_s = max_offset_s + rate_bound * lever_s
+        furthest_s = MAX_OFFSET_S + rate_bound * lever_s
         n_lags = int(np.ceil(furthest_s / sigma_s))
         best = delay(
             pair,
@@ -184,9 +177,9 @@ def estimate_clock(
             np.linspace(-rate_bound, rate_bound, 2 * n_rates + 1).tolist(),
             same_peak_s=SAME_PEAK_SIGMAS * sigma_s,
             floor=RIVAL_FLOOR,
-            within=lambda lag_s, rate: np.abs(lag_s - rate * lever_s) <= max_offset_s * (1.0 + 1e-9),
+            within=lambda lag_s, rate: np.abs(lag_s - rate * lever_s) <= MAX_OFFSET_S * (1.0 + 1e-9),
             mirrored=True,
-            rate_max=max_rate,
+            rate_max=MAX_RATE,
             rate_stays=rate_bound == 0.0,
             at_bounds=True,
             memory_s=None,
@@ -199,14 +192,14 @@ def estimate_clock(
     if fit.correlation < MIN_CORRELATION or fit.gain < MIN_GAIN_SIGMAS * fit.gain_std:
         return none(DelayStatus.NOT_EXCITED, fit.correlation)
     offset_s = -fit.lag_s + fit.rate * lever_s
-    if abs(offset_s) > 0.98 * max_offset_s or abs(fit.rate) > 0.98 * max_rate:
+    if abs(offset_s) > 0.98 * MAX_OFFSET_S or abs(fit.rate) > 0.98 * MAX_RATE:
         return none(DelayStatus.AT_BOUND, fit.correlation)
     if best.status is DelayStatus.AMBIGUOUS:
         return none(DelayStatus.AMBIGUOUS, fit.correlation)
     # of the gyro over the wheels, as the model has it, where the fit is that of the wheels over the gyro
     gain = fit.correlation**2 / fit.gain
     if rate_bound == 0.0:
-        std_s = float(np.hypot(np.sqrt(fit.cov[0, 0]), lever_s * max_rate / np.sqrt(3.0)))
+        std_s = float(np.hypot(np.sqrt(fit.cov[0, 0]), lever_s * MAX_RATE / np.sqrt(3.0)))
         rates, status = (np.nan, np.nan), DelayStatus.OFFSET_ONLY
     else:
         to_start = np.array([1.0, -lever_s])

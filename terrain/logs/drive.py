@@ -1,6 +1,6 @@
-r"""Reader of the logs of DRIVE: random wheel commands in, lidar pose out.
+r"""Readers of the logs of DRIVE, random wheel commands in, lidar pose out: sessions of windows, and whole recordings.
 
-A session is a folder with ``samples.csv.gz``, windows of 40 samples at 20 Hz (Baril et al., DRIVE:
+**Sessions.**  A session is a folder with ``samples.csv.gz``, windows of 40 samples at 20 Hz (Baril et al., DRIVE:
 Data-driven Robot Input Vector Exploration, ICRA 2024; repositories norlab-ulaval/DRIVE, ``calib_data``, and
 norlab-ulaval/doughnut_calib).  Three windows belong to a command, one while the
 robot changes its speed (``steady`` 0) and two after (``steady`` 1): they become a run ``step_000``,
@@ -41,6 +41,37 @@ Husky's log, then of six sessions of a Warthog and one of a Marmotte:
   wheels 0.8 times as fast against each other.  Commands go up to 14.7 rad/s, steady wheels to 6.1 rad/s.
 - ``steady``, ``icp_z``, ``icp_roll`` and ``icp_pitch`` are left out: the first says which window of a
   command it is, the others are relative to each window's own start.
+
+**Recordings**, with motor currents and lidar poses, the topics of a robot at 20 Hz:
+``<robot>_<terrain>/<recording>.csv.gz`` (in both repositories, ``raw_dataframe``).  The folder names robot and
+terrain, as ``husky_wet_grass``; a recording is the session of its runs.  A step is one command: what was driven under
+it is a run ``<folder>_<recording>_step_001``; an operator drives before the first one and between them, which makes
+the runs ``..._hand_000``.  Terrain is taken to be that of the folder throughout.
+
+Streams are ``wheels`` (:data:`WHEELS`, times the nominal radius), ``imu`` (:data:`IMU`), ``commands``
+(:data:`DESIRED`), and of ``icp_pos_*`` and ``icp_quat_*`` ``lidar`` (:mod:`~terrain.logs.held`) and ``pose``.
+
+Nothing of this is documented by the authors.  Compared with one another, the columns of four recordings of a
+Warthog and one of a Husky show:
+
+- *State*: ``calib`` while a command drives, ``idle`` while an operator does, who then lets the command begin
+  anew; empty before the first command, ``drive_finished`` after the last.  ``cmd_*`` of what an operator
+  drives is not logged (it is 0, or that of the step): these runs have no ``commands``.
+- *Signs*: the imu is a gyro in rad/s and a specific force, with the axes of the robot on the Warthog
+  (:mod:`terrain.logs.imu_axes` finds others).  It agrees with the lidar's yaw rate to 2 % and with the
+  wheels' at r = 0.998.
+- *Poses* are of one fixed frame, that of the first scan, and head where the robot does: turned by their yaw
+  their speed sideways is 0.02 m/s rms.
+- *Late*: lidar poses lag the gyro by 0.25 to 0.5 s, the wheels by 0.05 to 0.1 s.  Times are as logged.
+- *Held*: the Warthog's wheels are new every 0.25 s, its currents and voltages every second, the Husky's every
+  0.15 s; they are read as straight lines between (:mod:`terrain.logs.held`).
+- *Currents* of the Husky are never negative: magnitudes, which stay as they are and are counted.  The
+  Warthog's are positive where a side drives, forwards or backwards, and negative where it brakes: the sign of
+  the power, which is turned into that of the torque (forward positive) by the rotation of the wheel, and
+  counted.  Voltages are the supply's, not the motors'.
+- *Missing*: a column that holds nothing but 0 was not recorded (the Husky's imu), and the imu is 0 before its
+  first message.  Both are left out.
+- *Lost*: on the wet grass poses jump by up to 12 m.  Where they scatter too much for a speed they are NaN.
 """
 
 from __future__ import annotations
@@ -48,8 +79,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -60,22 +90,32 @@ from terrain.errors import LogError
 from terrain.files.names import normal_name
 from terrain.logs.held import CHANNELS as TWIST_CHANNELS
 from terrain.logs.held import (
+    MAX_STD,
     N_FRAME,
     body_twists,
     dated_poses,
-    frame_coefficient,
     is_first_pose,
     new_poses,
     undo_hold,
     usual_hold,
     usual_wait,
 )
-from terrain.logs.imu_axes import find_axes
-from terrain.logs.samples import check_log_file, checked_names, checked_stream, short_name
-from terrain.logs.tables import read_table, row_number
+from terrain.logs.imu_axes import MIN_MOVING_RADPS, POWER_SIGN, current_sign, find_axes, with_sign_of_torque
+from terrain.logs.samples import (
+    BAD_TIME,
+    check_log_file,
+    checked_names,
+    checked_stream,
+    longest_rise,
+    refuse_or_count,
+    short_name,
+)
+from terrain.logs.schema import POSE_CHANNELS
+from terrain.logs.tables import read_table, row_number, text_rows
 from terrain.records import Array, Label, RunLog
 
 FILE_NAME = "samples.csv.gz"
+SUFFIX = ".csv.gz"
 
 STREAMS: dict[str, dict[str, tuple[str, float]]] = {
     "wheels": {"speed_left_mps": ("wheel_left", 1.0), "speed_right_mps": ("wheel_right", 1.0)},
@@ -87,13 +127,36 @@ STREAMS: dict[str, dict[str, tuple[str, float]]] = {
     },
     "commands": {"wheel_left_radps": ("cmd_left", 1.0), "wheel_right_radps": ("cmd_right", 1.0)},
 }
-"""Column and factor of each channel that is read as it stands; those of the wheels are times the radius."""
+"""Column of a session and factor of each channel; those of the wheels are times the radius."""
+
+WHEELS: dict[str, str] = {
+    **{f"speed_{side}_mps": f"meas_{side}_vel" for side in ("left", "right")},
+    **{f"current_{side}_a": f"{side}_wheel_current" for side in ("left", "right")},
+    **{f"voltage_{side}_v": f"{side}_wheel_voltage" for side in ("left", "right")},
+}
+IMU: dict[str, str] = {
+    **{f"gyro_{axis}_radps": f"imu_{axis}" for axis in "xyz"},
+    **{f"accel_{axis}_mps2": f"imu_acceleration_{axis}" for axis in "xyz"},
+}
+DESIRED: dict[str, str] = {"speed_x_mps": "cmd_vel_x", "yaw_rate_radps": "cmd_vel_omega"}
+"""Column of a recording for each channel."""
 
 MAX_OVERSPEED = 1.5
 """Wheels that turn so many times as fast as the robot's own ever do are those of another robot; downhill, or
 with a measurement's noise, they turn 1.1 times as fast."""
 
+MIN_RUN_S = 2.0  #: Shorter stretches hold no window and no steady speed
+STANDING_S = 2.0  #: So long without motion ends what an operator drove
+MARGIN_S = 0.5  #: What is kept of the standing before and after it: starts and stops are whole
+BREAK_PERIODS = 2.5  #: A longer wait between two rows ends a run: samples are lost
+COMMANDED = "calib"  #: State in which the logged command drives
+
+NOT_RECORDED = "columns that were not recorded"
+LOST = "poses where the lidar lost the robot"
+STILL = "commands under which nothing moved"
+
 _KEYS, _POSE = ("step", "window", "steady", "time"), ("icp_x", "icp_y", "icp_yaw")
+_POSITION, _QUATERNION = ("icp_pos_x", "icp_pos_y"), tuple(f"icp_quat_{part}" for part in "xyzw")
 _MAX_OVERLAP = 5  # samples; 3 is the most that is there
 
 
@@ -104,90 +167,118 @@ class DriveRobot(NamedTuple):
     wheel_radius_m: float
     wheel_rate_max_radps: float = math.inf
 
+    def check(self, file: str, wheel_radps: Array) -> None:
+        """Refuse wheels (..., 2) of a file that turn much faster than this robot's ever do; ``LogError``."""
+        fastest = float(np.nanmax(np.abs(wheel_radps), initial=0.0))
+        if fastest > MAX_OVERSPEED * self.wheel_rate_max_radps:
+            raise LogError(
+                f"{file}: its wheels turn at up to {fastest:.1f} rad/s, those of robot {self.name} at up to "
+                f"{self.wheel_rate_max_radps:.1f} rad/s: name the robot that drove it (--robot)"
+            )
 
-@dataclass(frozen=True, slots=True, eq=False)
+
+def _refuse(fault: LogError, *, repair: bool = False) -> RunLog:
+    raise fault
+
+
+# -- Sessions of windows --------------------------------------------------------------------------------------
+
+
 class _Session:
-    """A whole session: n windows of k samples."""
+    """A whole session: n windows of k samples, of which those of a command, from one to another, make a run."""
 
-    file: str
-    robot: str
-    session: str  # empty where it has no name
-    terrain: str  # empty where unknown
-    step: Array  # (n,)
-    steady: Array  # (n,)
-    time_s: Array  # (k,) within a window
-    values: dict[str, Array]  # by stream (n, k, channels)
-    held: tuple[int, ...]  # usual samples from one new value of a wheel to the next; 1 where not to be undone
-    repairs: dict[str, int]  # of signs, as counts by kind
-    pose: Array  # (n, k, 3) as published
-    frame_yaw: Array  # (n,) heading of the frame of a window's positions
+    def __init__(self, path: Path, data: Path, robot: DriveRobot) -> None:
+        """Read the session in a folder, whose name is that of the session if it has a number."""
+        name = normal_name(path.resolve().name)
+        numbered = re.fullmatch(r"(.+)_\d+", name)
+        self.session = name if numbered or path != data else ""
+        self.terrain = numbered[1] if numbered else ""
+        file = check_log_file(path / FILE_NAME, path)
+        self.file, self.robot = short_name(file), robot.name
+        read = [*_KEYS, *_POSE, *(column for pairs in STREAMS.values() for column, _ in pairs.values())]
+        table = read_table(file, read)
+        keys = _checked_keys(file, table[:, : len(_KEYS)])
+        n, k, _ = keys.shape
+        self.step, self.steady = (keys[:, 0, i].astype(np.int64) for i in (0, 2))
+        self.period_s = round(float(keys[0, -1, 3] - keys[0, 0, 3]) / (k - 1), 9)
+        columns = dict(zip(read, table.T.reshape(-1, n, k), strict=True))
+        self.values = {
+            name: np.stack([columns[column] * factor for column, factor in pairs.values()], axis=-1)
+            for name, pairs in STREAMS.items()
+        }
+        wheels, imu = self.values["wheels"], self.values["imu"]
+        self.holds = [usual_hold(wheel, self.period_s) for wheel in np.moveaxis(wheels, -1, 0)]
+        robot.check(self.file, wheels)
+        wheels *= robot.wheel_radius_m
+        axes = find_axes([(*w.T, i[:, 0], i[:, 1:]) for w, i in zip(wheels, imu, strict=True)], self.period_s)
+        imu *= (axes.gyro_z, *axes.accel)
+        self.repairs = axes.repairs()
+        self.pose = np.stack([columns[name] for name in _POSE], axis=-1)  # as published
+        self.frame_yaw = self.pose[:, :N_FRAME, 2].mean(axis=1)  # of the frame of a window's positions
+        if is_first_pose(self.pose, wheels, self.period_s):
+            self.frame_yaw = self.pose[:, 0, 2]
+            self.repairs["lidar: positions in the frame of the first pose"] = n
+        self.values["lidar"], _ = body_twists(self.pose, self.period_s, self.frame_yaw)
 
+    def commands(self) -> Iterator[slice]:
+        """Return the windows of each command."""
+        starts = np.flatnonzero(self.steady == 0).tolist()
+        if not starts or starts[0] != 0:
+            raise LogError(f"{self.file}: the first window has steady 1; a command begins with steady 0")
+        return map(slice, starts, [*starts[1:], len(self.steady)])
 
-class _Command(NamedTuple):
-    """The windows ``start`` to ``end``, not included, of a session that make a run."""
-
-    windows: _Session
-    start: int
-    end: int
-
-    def name(self) -> tuple[str, int]:
-        """Return the id of the run and the step of the command."""
-        windows, steps = self.windows, np.unique(self.windows.step[self.start + 1 : self.end])
+    def name(self, windows: slice) -> tuple[str, int]:
+        """Return the id of the run and the step of a command."""
+        steps = np.unique(self.step[windows][1:])
         if not steps.size:
             raise LogError(
-                f"{windows.file}: the command of step {windows.step[self.start]} has one window only, "
+                f"{self.file}: the command of step {self.step[windows.start]} has one window only, "
                 "at least one with steady 1 must follow it"
             )
         if steps.size > 1:
             listed = ", ".join(map(str, steps))
-            raise LogError(f"{windows.file}: the windows of one command have the steps {listed}")
-        return "_".join([*filter(None, [windows.session]), f"step_{steps[0]:03d}"]), int(steps[0])
+            raise LogError(f"{self.file}: the windows of one command have the steps {listed}")
+        return "_".join([*filter(None, [self.session]), f"step_{steps[0]:03d}"]), int(steps[0])
 
-    def clock(self) -> tuple[Array, Array]:
+    def clock(self, windows: slice) -> tuple[Array, Array]:
         """Return which samples (windows, k) to keep, and the time of these from the first one of the run."""
-        time_s, steady = self.windows.time_s, self.windows.steady[self.start : self.end]
-        period_s = float(time_s[1] - time_s[0])
-        logged = [self.windows.values[name][self.start : self.end] for name in ("wheels", "imu")]
-        logged_all = np.concatenate(logged, axis=-1)
-        kept, at_s = np.ones(logged_all.shape[:2], dtype=bool), np.zeros(len(steady))
+        steady = self.steady[windows]
+        logged = np.concatenate([self.values[name][windows] for name in ("wheels", "imu")], axis=-1)
+        n_samples, at_s = logged.shape[1], np.zeros(len(steady))
+        kept: Array = np.ones(logged.shape[:2], dtype=bool)
         for i in range(1, len(steady)):
-            before, after = logged_all[i - 1], logged_all[i]
-            lengths = range(1, _MAX_OVERLAP + 1)
-            if np.array_equal(before[-2], before[-1], equal_nan=True):
-                lengths = range(0)  # a row that was held shows nothing
-            again = max(
-                (n for n in lengths if np.array_equal(before[-n:], after[:n], equal_nan=True)), default=0
-            )
+            before, after = logged[i - 1], logged[i]
+            again = 0
+            if not np.array_equal(before[-2], before[-1], equal_nan=True):  # a held row shows nothing
+                for n in range(1, _MAX_OVERLAP + 1):
+                    again = n if np.array_equal(before[-n:], after[:n], equal_nan=True) else again
             kept[i, :again] = False
             lost = 1 if steady[i - 1] == 0 and not again else 0
-            at_s[i] = at_s[i - 1] + (time_s.size - again + lost) * period_s
-        return kept, (at_s[:, None] + time_s - time_s[0])[kept]
+            at_s[i] = at_s[i - 1] + (n_samples - again + lost) * self.period_s
+        return kept, (at_s[:, None] + self.period_s * np.arange(n_samples))[kept]
 
-    def run(self, *, repair: bool = False) -> RunLog:
-        windows = self.windows
-        run_id, step = self.name()
-        kept, time_s = self.clock()
-        dropped: Counter[str] = Counter(windows.repairs)
+    def run(self, windows: slice, *, repair: bool = False) -> RunLog:
+        """Return the run of a command."""
+        run_id, step = self.name(windows)
+        kept, time_s = self.clock(windows)
+        dropped: Counter[str] = Counter(self.repairs)
         streams = {}
-        for name, logged in windows.values.items():
-            values = logged[self.start : self.end][kept]
-            if name == "wheels":
-                values = undo_hold(values, time_s, windows.held)
+        for name, logged in self.values.items():
+            values = logged[windows][kept]
             sources = STREAMS.get(name, {})
             streams[name] = checked_stream(
-                f"{windows.file}, {run_id}",
+                f"{self.file}, {run_id}",
                 time_s,
-                values,
+                undo_hold(values, time_s, self.holds) if name == "wheels" else values,
                 list(sources) or TWIST_CHANNELS,
                 columns=[column for column, _ in sources.values()],
                 repairs=dropped if repair else None,
                 unknown_is_a_value=name == "lidar",
             )
-        until_s = float(time_s[-1] + windows.time_s[1] - windows.time_s[0])
-        labels = (Label(0.0, until_s, windows.terrain),) if windows.terrain else ()
-        source = f"{windows.file}, step {step}, DRIVE layout"
-        run = RunLog(run_id, windows.robot, streams, labels, source, dropped, windows.session)
-        return checked_names(windows.file, run)
+        labels = (Label(0.0, float(time_s[-1]) + self.period_s, self.terrain),) if self.terrain else ()
+        source = f"{self.file}, step {step}, DRIVE layout"
+        run = RunLog(run_id, self.robot, streams, labels, source, dropped, self.session)
+        return checked_names(self.file, run)
 
 
 def find_sessions(folder: Path) -> list[Path]:
@@ -217,69 +308,12 @@ def find_runs(folder: Path, robot: DriveRobot) -> list[Callable[..., RunLog]]:
     readers: list[Callable[..., RunLog]] = []
     for path in find_sessions(folder):
         if (path / FILE_NAME).is_file():
-            readers += [partial(_Command.run, command) for command in _commands_of(path, folder, robot)]
+            session = _Session(path, folder, robot)
+            readers += [partial(session.run, windows) for windows in session.commands()]
         else:
-            readers.append(partial(_refuse, path))
+            fault = f"{path}: has no {FILE_NAME}, which the other sessions beside it have"
+            readers.append(partial(_refuse, LogError(fault)))
     return readers
-
-
-def _refuse(folder: Path, *, repair: bool = False) -> RunLog:
-    raise LogError(f"{folder}: has no {FILE_NAME}, which the other sessions beside it have")
-
-
-def _commands_of(path: Path, data: Path, robot: DriveRobot) -> list[_Command]:
-    """Return the commands of a session; the name of its folder is that of the session if it has a number."""
-    name = normal_name(path.resolve().name)
-    numbered = re.fullmatch(r"(.+)_\d+", name)
-    session = name if numbered or path != data else ""
-    terrain = numbered[1] if numbered else ""
-    windows = _read_session(check_log_file(path / FILE_NAME, path), robot, session, terrain)
-    starts = np.flatnonzero(windows.steady == 0).tolist()
-    if not starts or starts[0] != 0:
-        raise LogError(f"{windows.file}: the first window has steady 1; a command begins with steady 0")
-    ends = [*starts[1:], len(windows.steady)]
-    return [_Command(windows, start, end) for start, end in zip(starts, ends, strict=True)]
-
-
-def _read_session(path: Path, robot: DriveRobot, session: str, terrain: str) -> _Session:
-    sources = {name: list(columns.values()) for name, columns in STREAMS.items()}
-    read = [*_KEYS, *_POSE, *(column for pairs in sources.values() for column, _ in pairs)]
-    table = read_table(path, read)
-    keys = _checked_keys(path, table[:, : len(_KEYS)])
-    n, k, _ = keys.shape
-    time_s = keys[0, :, 3]
-    period_s = round(float(time_s[-1] - time_s[0]) / (k - 1), 9)
-    columns = dict(zip(read, table.T.reshape(-1, n, k), strict=True))
-    values = {
-        name: np.stack([columns[column] * factor for column, factor in pairs], axis=-1)
-        for name, pairs in sources.items()
-    }
-    wheels, imu = values["wheels"], values["imu"]
-    held = tuple(usual_hold(wheel, period_s) for wheel in np.moveaxis(wheels, -1, 0))
-    refuse_other_robot(short_name(path), wheels, robot)
-    wheels *= robot.wheel_radius_m
-    axes = find_axes([(*w.T, i[:, 0], i[:, 1:]) for w, i in zip(wheels, imu, strict=True)], period_s)
-    imu *= (axes.gyro_z, *axes.accel)
-    repairs = axes.repairs()
-    pose = np.stack([columns[name] for name in _POSE], axis=-1)
-    frame_yaw = pose[:, :N_FRAME, 2].mean(axis=1)
-    if is_first_pose(*frame_coefficient(pose, wheels, period_s)):
-        frame_yaw = pose[:, 0, 2]
-        repairs["lidar: positions in the frame of the first pose"] = len(pose)
-    values["lidar"], _ = body_twists(pose, period_s, frame_yaw)
-    step, steady = (keys[:, 0, i].astype(np.int64) for i in (0, 2))
-    about = (short_name(path), robot.name, session, terrain, step, steady, np.arange(k) * period_s)
-    return _Session(*about, values, held, repairs, pose, frame_yaw)
-
-
-def refuse_other_robot(name: str, wheel_radps: Array, robot: DriveRobot) -> None:
-    """Refuse wheels (..., 2) of a file that turn much faster than those of a robot ever do; ``LogError``."""
-    fastest = float(np.nanmax(np.abs(wheel_radps), initial=0.0))
-    if fastest > MAX_OVERSPEED * robot.wheel_rate_max_radps:
-        raise LogError(
-            f"{name}: its wheels turn at up to {fastest:.1f} rad/s, those of robot {robot.name} at up to "
-            f"{robot.wheel_rate_max_radps:.1f} rad/s: name the robot that drove it (--robot)"
-        )
 
 
 def _checked_keys(path: Path, keys: Array) -> Array:
@@ -330,12 +364,12 @@ def read_window_poses(folder: Path, robot: DriveRobot) -> dict[str, tuple[Window
     """
     runs: dict[str, tuple[WindowPoses, ...]] = {}
     for path in find_sessions(folder):
-        for command in _commands_of(path, folder, robot):
-            session = command.windows
-            kept, time_s = command.clock()
-            begins_s = time_s[np.cumsum(kept.sum(axis=1)) - 1] - session.time_s[-1]
-            new = new_poses(session.pose)
-            scan = usual_wait(new)
+        session = _Session(path, folder, robot)
+        new = new_poses(session.pose)
+        scan, until_s = usual_wait(new), session.period_s * (new.shape[1] - 1)
+        for command in session.commands():
+            kept, time_s = session.clock(command)
+            begins_s = time_s[np.cumsum(kept.sum(axis=1)) - 1] - until_s
             windows = []
             for i, begin_s in enumerate(begins_s, command.start):
                 at, pose, _ = dated_poses(session.pose[i], new[i], scan)
@@ -344,6 +378,223 @@ def read_window_poses(folder: Path, robot: DriveRobot) -> dict[str, tuple[Window
                 turn = np.exp(-1j * (pose[0, 2] - session.frame_yaw[i]))
                 place = (pose[:, 0] - pose[0, 0] + 1j * (pose[:, 1] - pose[0, 1])) * turn
                 at_first = np.column_stack([place.real, place.imag, pose[:, 2] - pose[0, 2]])
-                windows.append(WindowPoses(begin_s + session.time_s[at], at_first))
-            runs[command.name()[0]] = tuple(windows)
+                windows.append(WindowPoses(begin_s + session.period_s * at, at_first))
+            runs[session.name(command)[0]] = tuple(windows)
     return runs
+
+
+# -- Whole recordings -----------------------------------------------------------------------------------------
+
+
+def cut_recording(
+    step: Array, commanded: Array, moving: Array, breaks: Array, period_s: float
+) -> tuple[list[tuple[int, int, str]], int]:
+    """Return the runs of a recording, first row, end (not included) and name, and how many commands moved nothing.
+
+    A run is what follows without a break in one step under the logged command (``step_003``; where an
+    operator intervened, so that it was begun anew, ``step_003_2``), or what was driven otherwise, between two
+    times of standing (``hand_000``, ``hand_001``).  The arrays (n,) are number of the command, and whether the logged
+    command drives, a wheel turns, and samples are lost before a row.
+
+    Examples
+    --------
+    >>> step = np.repeat([0, 1, 2], 60)
+    >>> moving = np.repeat([False, True, True, False], 45)
+    >>> cut_recording(step, step > 0, moving, np.zeros(180, bool), 0.05)[0][:2]
+    [(60, 120, 'step_001'), (120, 180, 'step_002')]
+    """
+
+    def stretches(*keys: Array) -> Iterator[tuple[int, int]]:
+        """Return first row and end of each stretch of equal keys without a break."""
+        table = np.column_stack(keys)
+        changes = (table[1:] != table[:-1]).any(axis=1) | breaks[1:].astype(bool)
+        starts = np.flatnonzero(np.r_[len(table) > 0, changes]).tolist()
+        return zip(starts, [*starts[1:], len(table)], strict=False)
+
+    n_min, margin = round(MIN_RUN_S / period_s), round(MARGIN_S / period_s)
+    cuts: list[tuple[int, int, str]] = []
+    seen: Counter[int] = Counter()
+    n_still = n_hand = 0
+    for first, end in stretches(step, commanded):
+        if commanded[first] and end - first >= n_min:
+            if moving[first:end].any():
+                seen[number := int(step[first])] += 1
+                again = f"_{seen[number]}" if seen[number] > 1 else ""
+                cuts.append((first, end, f"step_{number:03d}{again}"))
+            else:
+                n_still += 1
+    for first, end in stretches(commanded):
+        rows = first + np.flatnonzero(moving[first:end])
+        if commanded[first] or not rows.size:
+            continue
+        apart = np.flatnonzero(np.diff(rows) * period_s > STANDING_S)
+        starts = np.maximum(rows[np.r_[0, apart + 1]] - margin, first)
+        stops = np.minimum(rows[np.r_[apart, rows.size - 1]] + 1 + margin, end)
+        for start, stop in zip(starts.tolist(), stops.tolist(), strict=True):
+            if stop - start >= n_min:
+                cuts.append((start, stop, f"hand_{n_hand:03d}"))
+                n_hand += 1
+    return sorted(cuts), n_still
+
+
+def find_recordings(folder: Path) -> list[Path]:
+    """Return the recordings in a folder, or in the folders in it, sorted; hidden ones are passed over."""
+    for pattern in (f"*{SUFFIX}", f"*/*{SUFFIX}"):
+        paths = [path for path in folder.glob(pattern) if path.name != FILE_NAME]
+        shown = [path for path in paths if not path.name.startswith(".") and path.parent.name[:1] != "."]
+        if shown:
+            return sorted(shown)
+    return []
+
+
+def find_recorded_runs(folder: Path, robot_of: Callable[[str], DriveRobot]) -> list[Callable[..., RunLog]]:
+    """Return one reader per run of the recordings in ``folder``; call it with ``repair=``.
+
+    The recordings are read at once.  One that cannot be read has a reader too, which raises
+    :class:`LogError`; where a repairing read can, its runs' readers raise unless they repair.
+
+    ``robot_of`` gives the robot of a name, or raises ``ConfigError``.
+    """
+    readers: list[Callable[..., RunLog]] = []
+    for path in find_recordings(folder):
+        name = normal_name(path.resolve().parent.name)
+        robot_name, _, terrain = name.partition("_")
+        if not robot_name or not terrain:
+            raise LogError(
+                f"{short_name(path)}: its folder is called {name!r}, which has to name robot and terrain, as "
+                "husky_wet_grass"
+            )
+        robot = robot_of(robot_name)
+        fault: LogError | None = None
+        try:
+            recording = _Recording(path, robot, terrain, None)
+        except LogError as error:
+            fault = error
+            try:
+                recording = _Recording(path, robot, terrain, Counter())
+            except LogError:
+                readers.append(partial(_refuse, error))
+                continue
+        readers += [partial(recording.run, number, fault) for number in range(len(recording.cuts))]
+    return readers
+
+
+class _Recording:
+    """A whole recording, row by row, cut into runs; streams that it lacks are missing."""
+
+    def __init__(self, path: Path, robot: DriveRobot, terrain: str, repairs: Counter[str] | None) -> None:
+        self.name, self.robot, self.terrain = short_name(check_log_file(path, path.parent)), robot, terrain
+        self.session = normal_name(f"{path.resolve().parent.name}_{path.name.removesuffix(SUFFIX)}")
+        self.dropped: Counter[str] = Counter() if repairs is None else repairs
+        columns = ["time", "calib_step", *WHEELS.values(), *IMU.values(), *DESIRED.values()]
+        columns += [*_POSITION, *_QUATERNION]
+        table = read_table(path, columns, repairs=repairs)
+        state = np.array([cells[0] for _, cells in text_rows(path, ["calib_state"]) if cells is not None])
+        if len(table) < 2:
+            raise LogError(f"{self.name}: has {len(table)} rows of data, at least 2 are needed")
+        if len(state) != len(table):  # rows of another length, which both readers leave out alike
+            raise LogError(f"{self.name}: its rows do not have one state each")
+        time_s, finite = table[:, 0], np.flatnonzero(np.isfinite(table[:, 0]))
+        fallen = np.flatnonzero(~(np.diff(time_s) > 0.0))
+        if fallen.size or finite.size < len(table):
+            row = int(fallen[0]) + 1 if fallen.size else int(np.flatnonzero(~np.isfinite(time_s))[0])
+            at = f"{row_number(path, row)} ({time_s[row]:.15g} s after {time_s[row - 1]:.15g} s)"
+            kept = finite[longest_rise(time_s[finite])]
+            fault = f"{self.name}: time does not rise at row {at}: a clock that restarts?"
+            refuse_or_count(repairs, BAD_TIME, fault, len(table) - len(kept))
+            table, state = table[kept], state[kept]
+        column = dict(zip(columns, table.T, strict=True))
+        self.time_s, step = column["time"], column["calib_step"]
+        for row in np.flatnonzero(~((step >= 0) & (step == np.floor(step)))).tolist():
+            fault = f"calib_step at row {row + 2} is {step[row]:.15g}; it must be a whole number from 0 up"
+            raise LogError(f"{self.name}: {fault}")
+        wheels, imu, commands = (
+            np.column_stack([column[name] for name in names.values()]) for names in (WHEELS, IMU, DESIRED)
+        )
+        robot.check(self.name, wheels[:, :2])
+        self.period_s = float(np.median(np.diff(self.time_s)))
+        moving = (np.abs(wheels[:, :2]) >= MIN_MOVING_RADPS).any(axis=1)
+        breaks = np.diff(self.time_s, prepend=self.time_s[0]) > BREAK_PERIODS * self.period_s
+        self.cuts, n_still = cut_recording(step, state == COMMANDED, moving, breaks, self.period_s)
+        if not self.cuts:
+            raise LogError(f"{self.name}: its wheels turn for no more than a moment: it holds no run")
+        recorded = [i for i, values in enumerate(wheels.T) if i < 2 or np.nan_to_num(values).any()]
+        self.dropped[NOT_RECORDED] += wheels.shape[1] - len(recorded)
+        if currents := [i for i in (2, 3) if i in recorded]:
+            kind = current_sign(wheels[:, currents], wheels[:, [i - 2 for i in currents]])
+            self.dropped[kind] += len(currents) if kind else 0
+            for i in currents if kind == POWER_SIGN else ():
+                wheels[:, i] = with_sign_of_torque(wheels[:, i], wheels[:, i - 2], self.period_s)
+        wheels = wheels[:, recorded]
+        holds = [usual_hold(values[None], self.period_s) for values in wheels.T]
+        wheels = undo_hold(wheels, self.time_s, holds)
+        wheels[:, :2] *= robot.wheel_radius_m
+        self.streams = {"wheels": (tuple(tuple(WHEELS)[i] for i in recorded), wheels)}
+        if imu.any():
+            imu[: int(np.flatnonzero(imu.any(axis=1))[0])] = np.nan  # before the first message
+            rows = [slice(first, end) for first, end, _ in self.cuts]
+            parts = [(*wheels[each, :2].T, imu[each, 2], imu[each, 3:]) for each in rows]
+            axes = find_axes(parts, self.period_s)
+            self.dropped.update(axes.repairs())
+            self.streams["imu"] = tuple(IMU), imu * (*axes.gyro(), *axes.accel)
+        else:
+            self.dropped[NOT_RECORDED] += imu.shape[1]
+        position = np.column_stack([column[name] for name in _POSITION])
+        poses, self.posed, twist = self._lidar(position, *(column[name] for name in _QUATERNION))
+        if not np.isfinite(twist).any():
+            raise LogError(f"{self.name}: its lidar has lost the robot throughout: no pose gives a speed")
+        self.streams |= {"lidar": (TWIST_CHANNELS, twist), "pose": (POSE_CHANNELS, poses)}
+        self.streams["commands"] = tuple(DESIRED), commands
+        self.dropped[STILL] += n_still
+
+    def run(self, number: int, fault: LogError | None, *, repair: bool = False) -> RunLog:
+        """Return one run; what concerns the whole recording is counted with its first one."""
+        if fault is not None and not repair:
+            raise fault
+        first, end, name = self.cuts[number]
+        dropped: Counter[str] = Counter({} if number else self.dropped)
+        run_id, rows = f"{self.session}_{name}", slice(first, end)
+        time_s = self.time_s[rows] - self.time_s[first]
+        streams = {}
+        for stream, (channels, logged) in self.streams.items():
+            values, kept = logged[rows], np.ones(len(time_s), dtype=bool)
+            if stream == "pose":
+                kept = self.posed[rows]
+            elif stream == "imu":
+                kept = np.asarray(~np.isnan(values).all(axis=1))
+            if (stream == "commands" and name.startswith("hand")) or (stream == "pose" and kept.sum() < 2):
+                continue
+            streams[stream] = checked_stream(
+                f"{self.name}, {run_id}",
+                time_s[kept],
+                values[kept],
+                channels,
+                row_of=lambda row: row + first + 2,
+                repairs=dropped if repair else None,
+                unknown_is_a_value=stream in ("lidar", "pose"),
+            )
+        if "pose" in streams:
+            dropped[LOST] += int(np.isnan(streams["pose"].values[:, 0]).sum())
+        labels = (Label(0.0, float(time_s[-1]) + self.period_s, self.terrain),)
+        source = f"{self.name}, rows {first + 2} to {end + 1}, recording of DRIVE"
+        run = RunLog(run_id, self.robot.name, streams, labels, source, +dropped, self.session)
+        return checked_names(self.name, run)
+
+    def _lidar(self, position: Array, x: Array, y: Array, z: Array, w: Array) -> tuple[Array, Array, Array]:
+        """Return poses (n, 3), which rows (n,) they are of, and the twist (n, 3) at each row."""
+        yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        yaw = np.where(x * x + y * y + z * z + w * w > 0.5, yaw, np.nan)
+        place = np.round((self.time_s - self.time_s[0]) / self.period_s).astype(np.intp)  # on an even grid
+        rows = np.searchsorted(place, np.arange(place[-1] + 1), side="right") - 1
+        even = np.column_stack([position, yaw])[rows]
+        (twist,), (std,) = body_twists(even[None], self.period_s, np.zeros(1))
+        twist[~(std <= MAX_STD).all(axis=1)] = np.nan
+        new = new_poses(even[None])
+        at, _, arrival = dated_poses(even, new[0], usual_wait(new))
+        came = even[arrival]
+        # without what is left out, which may be a registration that jumped
+        came[:, 2] = np.unwrap(came[:, 2])
+        came[(std[at] > MAX_STD).any(axis=1)] = np.nan
+        poses, posed = np.full((len(even), 3), np.nan), np.zeros(len(even), dtype=bool)
+        poses[at], posed[at] = came, True
+        return poses[place], posed[place], twist[place]

@@ -20,12 +20,10 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import lru_cache
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from terrain.errors import DataError
 from terrain.logs.samples import MAX_MAGNITUDE
@@ -62,29 +60,23 @@ OFFSET_TOLERANCE_S = 0.3
 MAX_HOLE_S = 15.0
 #: An overlap that reaches so close to the end of a run reaches its end: the first peaks come later.
 EDGE_S = 1.5
-N_FILES = 32
-#: 2^64 over the golden ratio: the first bits of a product with it are spread evenly (Knuth, The Art of Computer
-#: Programming 3, section 6.4).
-SPREADING = np.uint64(0x9E3779B97F4A7C15)
 #: A peak of a channel of a run; ``spread`` is that of the channel.
 PEAK = np.dtype([("run", int), ("time_s", float), ("height", float), ("spread", float), ("period_s", float)])
-#: A fingerprint, the time of its first peak, and the run.
-PRINT = np.dtype([("code", "<i8"), ("time_s", "<f8"), ("run", "<i4")])
 
-
-# -- Fingerprints ---------------------------------------------------------------------------------------------
+PART_GAP_S = 1.0  #: Between two parts of a merged run; far longer than the gaps that a window may have.
+LABEL_MARGIN_S = 2.0  #: Labels are compared this far inside of a stretch, whose ends are known to a second.
+MAX_SHOWN = 3  #: Pairs that a refusal names.
 
 
 def _measured(run: RunLog) -> list[tuple[Stream, list[int]]]:
     """Return the streams that were measured, with the places of the channels that features are made of."""
-    chosen = ((stream, _places(name, tuple(stream.channels))) for name, stream in run.streams.items())
-    return [(stream, list(places)) for stream, places in chosen if places and len(stream) > 1]
-
-
-@lru_cache(maxsize=1024)
-def _places(stream: str, channels: tuple[str, ...]) -> tuple[int, ...]:
-    """Return the places of the measured channels of a stream; all runs of a data set ask for the same."""
-    return tuple(i for i, each in enumerate(channels) if signal_set_of(stream, each) in MEASURED_SETS)
+    streams = []
+    for name, stream in run.streams.items():
+        channels = enumerate(stream.channels)
+        places = [i for i, channel in channels if signal_set_of(name, channel) in MEASURED_SETS]
+        if places and len(stream) > 1:
+            streams.append((stream, places))
+    return streams
 
 
 def _fingerprints(runs: Sequence[RunLog]) -> tuple[Array, Array, Array]:
@@ -92,44 +84,31 @@ def _fingerprints(runs: Sequence[RunLog]) -> tuple[Array, Array, Array]:
     codes, starts, peaks = [np.empty(0, np.int64)], [np.empty(0, int)], [np.empty(0, PEAK)]
     n_peaks = 0
     for number, run in enumerate(runs):
-        for stream, places in _measured(run):
-            for place in places:
-                smooth = _low_pass(stream.values[:, place], SMOOTHING_S * stream.rate_hz)
-                at = 1 + np.flatnonzero((smooth[1:-1] > smooth[:-2]) & (smooth[1:-1] >= smooth[2:]))
-                if len(at) < N_PEAKS:
-                    continue
-                own = np.empty(len(at), PEAK)
-                own["run"], own["time_s"], own["height"] = number, stream.time_s[at], smooth[at]
-                own["spread"], own["period_s"] = np.nanstd(smooth), 1.0 / stream.rate_hz
-                codes.append(_codes(own["height"]))
-                starts.append(n_peaks + np.arange(len(codes[-1])))
-                peaks.append(own)
-                n_peaks += len(own)
+        for stream, place in ((stream, i) for stream, places in _measured(run) for i in places):
+            values = stream.values[:, place]
+            smooth = np.where(np.abs(values) <= MAX_MAGNITUDE, values, np.nan)
+            width = SMOOTHING_S * stream.rate_hz
+            half = min(int(np.ceil(3.0 * width)), (len(values) - 1) // 2)
+            if width >= 0.5 and half >= 1:
+                smooth = gaussian_filter1d(smooth, width, radius=half)
+                smooth[:half] = smooth[len(smooth) - half :] = np.nan
+            at = 1 + np.flatnonzero((smooth[1:-1] > smooth[:-2]) & (smooth[1:-1] >= smooth[2:]))
+            n = len(at) - N_PEAKS + 1
+            if n < 1:
+                continue
+            own = np.empty(len(at), PEAK)
+            own["run"], own["time_s"], own["height"] = number, stream.time_s[at], smooth[at]
+            own["spread"], own["period_s"] = np.nanstd(smooth), 1.0 / stream.rate_hz
+            code = np.zeros(n, dtype=np.int64)
+            for lag in LAGS:
+                higher = (smooth[at[:-lag]] < smooth[at[lag:]]).astype(np.int64)
+                for i in range(N_PEAKS - lag):
+                    code = code << 1 | higher[i : i + n]
+            codes.append(code)
+            starts.append(n_peaks + np.arange(n))
+            peaks.append(own)
+            n_peaks += len(own)
     return np.concatenate(codes), np.concatenate(starts), np.concatenate(peaks)
-
-
-def _low_pass(values: Array, std_samples: float) -> Array:
-    """Return values (n,) behind a Gaussian filter; NaN where one is near, and at both ends."""
-    values = np.where(np.abs(values) <= MAX_MAGNITUDE, values, np.nan)
-    half = min(int(np.ceil(3.0 * std_samples)), (len(values) - 1) // 2)
-    if std_samples < 0.5 or half < 1:
-        return values
-    weights = np.exp(-0.5 * (np.arange(-half, half + 1) / std_samples) ** 2)
-    smooth = np.convolve(values, weights / weights.sum(), mode="same")
-    smooth[:half] = smooth[len(smooth) - half :] = np.nan
-    return smooth
-
-
-def _codes(height: Array) -> Array:
-    """Return the fingerprint (n - N_PEAKS + 1,) that begins with each peak of a channel."""
-    n = len(height) - N_PEAKS + 1
-    codes = np.zeros(n, dtype=np.int64)
-    for lag in LAGS:
-        higher = (height[:-lag] < height[lag:]).astype(np.int64)
-        for i in range(N_PEAKS - lag):
-            codes <<= 1
-            codes |= higher[i : i + n]
-    return codes
 
 
 def _scaled_heights(peaks: Array) -> tuple[Array, Array]:
@@ -163,7 +142,53 @@ def _same_digests(digests: Iterable[bytes]) -> list[tuple[int, int]]:
     return [(first, i) for first, i in pairs if first != i]
 
 
-# -- Stretches that two runs share ----------------------------------------------------------------------------
+class RunPrint(NamedTuple):
+    """What of a run shows whether another one may hold a stretch of it."""
+
+    codes: Array  #: (n,) fingerprints of peaks whose heights vary, and the times of their first peaks
+    time_s: Array
+    digest: bytes  #: of the fastest stream; empty where its samples may repeat
+
+
+def run_print(run: RunLog) -> RunPrint:
+    """Return the fingerprints of a run."""
+    codes, start, peaks = _fingerprints([run])
+    varies = _scaled_heights(peaks[start[:, None] + np.arange(N_PEAKS)])[1]
+    return RunPrint(codes[varies], peaks["time_s"][start[varies]], _digest(run))
+
+
+def possible_pairs(prints: Sequence[RunPrint]) -> list[tuple[int, int]]:
+    """Return the pairs of runs, by their places, that may share a stretch; :func:`shared_stretches` decides.
+
+    They have enough equal fingerprints near one offset of their clocks, or equal digests.
+
+    Examples
+    --------
+    >>> codes, time_s = np.arange(9), np.arange(9.0)
+    >>> possible_pairs([RunPrint(codes, time_s, b""), RunPrint(codes[1:], 50.0 + time_s[1:], b"")])
+    [(0, 1)]
+    """
+    if not prints:
+        return []
+    codes, time_s = (np.concatenate([each[i] for each in prints]) for i in (0, 1))
+    run = np.repeat(np.arange(len(prints)), [len(each.codes) for each in prints])
+    one, other = _equal(codes, run)
+    order = np.lexsort((time_s[other] - time_s[one], run[other], run[one]))
+    one, other = one[order], other[order]
+    first, second, offset_s = run[one], run[other], time_s[other] - time_s[one]
+    a, b = slice(None, 1 - MIN_EQUAL), slice(MIN_EQUAL - 1, None)
+    near = offset_s[b] - offset_s[a] <= (MIN_EQUAL - 1) * (OFFSET_TOLERANCE_S + 0.1 * MAX_HOLE_S)
+    near &= (first[a] == first[b]) & (second[a] == second[b])
+    pairs = set(zip(first[a][near].tolist(), second[a][near].tolist(), strict=True))
+    return sorted(pairs.union(_same_digests(each.digest for each in prints)))
+
+
+def _equal(codes: Array, run: Array) -> tuple[Array, Array]:
+    """Return the places (m,) of equal codes that follow on one another, of two runs, the one before the other."""
+    order = np.argsort(codes, kind="stable")
+    one, other = order[:-1], order[1:]
+    same = (codes[one] == codes[other]) & (run[one] != run[other])
+    return one[same], other[same]
 
 
 class SharedStretch(NamedTuple):
@@ -221,11 +246,7 @@ def _matches(codes: Array, start: Array, peaks: Array) -> tuple[Array, Array]:
 
     Returned are the places of both runs (m, 2), and start and end of the peaks in the first and in the second (m, 4).
     """
-    order = np.argsort(codes, kind="stable")
-    codes, start = codes[order], start[order]
-    same = np.flatnonzero((codes[1:] == codes[:-1]) & (peaks["run"][start[1:]] != peaks["run"][start[:-1]]))
-    # stable: the run of a comes before that of b
-    a, b = (peaks[start[at][:, None] + np.arange(N_PEAKS)] for at in (same, same + 1))
+    a, b = (peaks[start[at][:, None] + np.arange(N_PEAKS)] for at in _equal(codes, peaks["run"][start]))
     (of_a, a_varies), (of_b, b_varies) = _scaled_heights(a), _scaled_heights(b)
     agree = a_varies & b_varies & (np.einsum("ij,ij->i", of_a, of_b) > MIN_CORRELATION)
     since_a, since_b = (each["time_s"] - each["time_s"][:, :1] for each in (a, b))
@@ -272,99 +293,8 @@ def _span(run: RunLog) -> tuple[float, float]:
     return min(float(s.time_s[0]) for s in streams), max(float(s.time_s[-1]) for s in streams)
 
 
-# -- Many runs: fingerprints in files -------------------------------------------------------------------------
-
-
-class RunPrint(NamedTuple):
-    """What of a run shows whether another one may hold a stretch of it."""
-
-    codes: Array  #: (n,) fingerprints of peaks whose heights vary, and the times of their first peaks
-    time_s: Array
-    digest: bytes  #: of the fastest stream; empty where its samples may repeat
-
-
-def run_print(run: RunLog) -> RunPrint:
-    """Return the fingerprints of a run."""
-    codes, start, peaks = _fingerprints([run])
-    varies = _scaled_heights(peaks[start[:, None] + np.arange(N_PEAKS)])[1]
-    return RunPrint(codes[varies], peaks["time_s"][start[varies]], _digest(run))
-
-
-class PrintFiles:
-    """Fingerprints of many runs in files by their value, while the block lasts: one is read at a time.
-
-    Examples
-    --------
-    >>> codes, time_s = np.arange(9), np.arange(9.0)
-    >>> with PrintFiles() as prints:
-    ...     prints.add(RunPrint(codes, time_s, b""))
-    ...     prints.add(RunPrint(codes[1:], 50.0 + time_s[1:], b""))
-    ...     prints.possible_pairs()
-    [(0, 1)]
-    """
-
-    def __init__(self) -> None:
-        self._digests: list[bytes] = []
-
-    def __enter__(self) -> PrintFiles:
-        self._folder = TemporaryDirectory()
-        self._files = [(Path(self._folder.name) / str(number)).open("w+b") for number in range(N_FILES)]
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for file in self._files:
-            file.close()
-        self._folder.cleanup()
-
-    def add(self, prints: RunPrint) -> None:
-        """Take the fingerprints of the next run."""
-        records = np.empty(len(prints.codes), PRINT)
-        records["code"], records["time_s"], records["run"] = prints.codes, prints.time_s, len(self._digests)
-        self._digests.append(prints.digest)
-        number = (prints.codes.astype(np.uint64) * SPREADING) // np.uint64(2**64 // N_FILES)
-        for each in np.unique(number).tolist():
-            self._files[each].write(records[number == each].tobytes())
-
-    def possible_pairs(self) -> list[tuple[int, int]]:
-        """Return the pairs of runs, by their places, that may share a stretch; :func:`shared_stretches` decides.
-
-        They have enough equal fingerprints near one offset of their clocks, or equal digests.
-        """
-        found = []
-        for file in self._files:
-            file.seek(0)
-            records = np.frombuffer(file.read(), PRINT)
-            records = records[np.argsort(records["code"], kind="stable")]
-            one, next_ = records[:-1], records[1:]
-            same = (one["code"] == next_["code"]) & (one["run"] != next_["run"])
-            one, next_ = one[same], next_[same]
-            found.append((one["run"], next_["run"], next_["time_s"] - one["time_s"]))
-        first, second, offset_s = map(np.concatenate, zip(*found, strict=True))
-        order = np.lexsort((offset_s, second, first))
-        first, second, offset_s = first[order], second[order], offset_s[order]
-        a, b = slice(None, 1 - MIN_EQUAL), slice(MIN_EQUAL - 1, None)
-        near = offset_s[b] - offset_s[a] <= (MIN_EQUAL - 1) * (OFFSET_TOLERANCE_S + 0.1 * MAX_HOLE_S)
-        near &= (first[a] == first[b]) & (second[a] == second[b])
-        pairs = set(zip(first[a][near].tolist(), second[a][near].tolist(), strict=True))
-        return sorted(pairs.union(_same_digests(self._digests)))
-
-
-# -- One run of those that share a stretch --------------------------------------------------------------------
-
-PART_GAP_S = 1.0  #: Between two parts of a merged run; far longer than the gaps that a window may have.
-LABEL_MARGIN_S = 2.0  #: Labels are compared this far inside of a stretch, whose ends are known to a second.
-MAX_SHOWN = 3  #: Pairs that a refusal names.
-
-
-class DistinctRuns(NamedTuple):
-    """Runs of which no two hold the same measurements, and the ids of those that were merged."""
-
-    runs: list[RunLog]
-    merged: tuple[tuple[str, ...], ...] = ()
-
-
-def distinct_runs(runs: Sequence[RunLog], *, merge: bool) -> DistinctRuns:
-    """Return runs of which no two hold the same measurements; merged, those that share a stretch count once.
+def distinct_runs(runs: Sequence[RunLog], *, merge: bool) -> tuple[list[RunLog], tuple[tuple[str, ...], ...]]:
+    """Return runs of which no two hold the same measurements, and the ids of those that were merged.
 
     Raises
     ------
@@ -373,14 +303,14 @@ def distinct_runs(runs: Sequence[RunLog], *, merge: bool) -> DistinctRuns:
     """
     found = shared_stretches(runs)
     if not found:
-        return DistinctRuns(list(runs))
+        return list(runs), ()
     _refuse_other_labels(runs, found)
     if not merge:
         raise DataError(
             f"{'; '.join(sentences(found))}: held out, they would be recognised and not classified; remove "
             "one of them, or use --merge-duplicates to treat them as one run"
         )
-    return DistinctRuns(merge_runs(runs, found), groups_of(found))
+    return merge_runs(runs, found), groups_of(found)
 
 
 def sentences(found: Sequence[SharedStretch]) -> list[str]:
@@ -438,15 +368,52 @@ def merge_runs(runs: Sequence[RunLog], stretches: Sequence[SharedStretch]) -> li
     _refuse_other_labels(runs, stretches)
     merged = {run.run_id: run for run in runs}
     for group in groups_of(stretches):
-        members = sorted((run for run in runs if run.run_id in group), key=lambda run: not run.labels)
-        parts = []  # a stable order: labelled runs first
-        for number, run in enumerate(members[1:], 1):
-            earlier = {other.run_id for other in members[:number]}
-            own = [each for each in stretches if run.run_id in each[:2] and earlier.intersection(each[:2])]
-            parts += [(run, *span) for span in _complement(run, [each.of(run.run_id) for each in own])]
-            del merged[run.run_id]
-        merged[members[0].run_id] = _join(members[0], parts)
-    return list(merged.values())
+        members = [merged.pop(run.run_id) for run in runs if run.run_id in group]
+        first, *others = sorted(members, key=lambda run: not run.labels)  # stable
+        streams, labels, earlier = dict(first.streams), list(first.labels), {first.run_id}
+        end_s = max(float(stream.time_s[-1]) for stream in streams.values())
+        for run in others:
+            taken = [each for each in stretches if run.run_id in each[:2] and earlier.intersection(each[:2])]
+            earlier.add(run.run_id)
+            at_s = min(float(stream.time_s[0]) for stream in run.streams.values())
+            until_s = max(float(stream.time_s[-1]) for stream in run.streams.values()) + 1e-9
+            for start_s, stop_s in [*sorted(each.of(run.run_id) for each in taken), (until_s, until_s)]:
+                if start_s - at_s > PART_GAP_S:  # at_s to start_s is in no other run
+                    end_s = _append(first.run_id, streams, labels, run, (at_s, start_s), end_s + PART_GAP_S)
+                at_s = max(at_s, stop_s)
+        merged[first.run_id] = replace(first, streams=streams, labels=tuple(labels))
+    return [merged[run.run_id] for run in runs if run.run_id in merged]
+
+
+def _append(
+    name: str,
+    streams: dict[str, Stream],
+    labels: list[Label],
+    run: RunLog,
+    span_s: tuple[float, float],
+    at_s: float,
+) -> float:
+    """Append a span of a run to the streams and labels of another, at a time; return the time of its end."""
+    start_s, stop_s = span_s
+    shift_s = at_s - start_s
+    for stream_name, stream in streams.items():
+        other = run.streams.get(stream_name)
+        if other is None or set(other.channels) != set(stream.channels):
+            raise DataError(
+                f"runs {name} and {run.run_id} hold the same measurements, but not the same "
+                f"channels of stream {stream_name!r}: remove one of the runs"
+            )
+        inside = (other.time_s >= start_s) & (other.time_s < stop_s)
+        order = [other.channels.index(channel) for channel in stream.channels]
+        time_s = np.concatenate([stream.time_s, other.time_s[inside] + shift_s])
+        values = np.concatenate([stream.values, other.values[inside][:, order]])
+        streams[stream_name] = Stream(time_s, values, stream.channels)
+    labels += [
+        Label(max(each.start_s, start_s) + shift_s, min(each.end_s, stop_s) + shift_s, each.terrain)
+        for each in run.labels
+        if each.start_s < stop_s and each.end_s > start_s
+    ]
+    return shift_s + stop_s
 
 
 def _refuse_other_labels(runs: Sequence[RunLog], stretches: Sequence[SharedStretch]) -> None:
@@ -468,43 +435,3 @@ def _refuse_other_labels(runs: Sequence[RunLog], stretches: Sequence[SharedStret
                 f"runs {stretch.first} and {stretch.second} hold the same measurements under the labels "
                 f"{' and '.join(labels[0])} and {' and '.join(labels[1])}: correct one, or remove a run"
             )
-
-
-def _complement(run: RunLog, taken: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return the spans of a run outside of some stretches."""
-    spans, at_s = [], min(float(stream.time_s[0]) for stream in run.streams.values())
-    end_s = max(float(stream.time_s[-1]) for stream in run.streams.values())
-    for start_s, stop_s in sorted(taken):
-        if start_s - at_s > PART_GAP_S:
-            spans.append((at_s, start_s))
-        at_s = max(at_s, stop_s)
-    if end_s - at_s > PART_GAP_S:
-        spans.append((at_s, end_s + 1e-9))
-    return spans
-
-
-def _join(first: RunLog, parts: Sequence[tuple[RunLog, float, float]]) -> RunLog:
-    """Return a run followed by parts of others, each a run with start and end of what is kept of it."""
-    streams, labels = dict(first.streams), list(first.labels)
-    end_s = max(float(stream.time_s[-1]) for stream in streams.values())
-    for run, start_s, stop_s in parts:
-        shift_s = end_s + PART_GAP_S - start_s
-        for name, stream in streams.items():
-            other = run.streams.get(name)
-            if other is None or set(other.channels) != set(stream.channels):
-                raise DataError(
-                    f"runs {first.run_id} and {run.run_id} hold the same measurements, but not the same "
-                    f"channels of stream {name!r}: remove one of the runs"
-                )
-            inside = (other.time_s >= start_s) & (other.time_s < stop_s)
-            order = [other.channels.index(channel) for channel in stream.channels]
-            time_s = np.concatenate([stream.time_s, other.time_s[inside] + shift_s])
-            values = np.concatenate([stream.values, other.values[inside][:, order]])
-            streams[name] = Stream(time_s, values, stream.channels)
-        labels += [
-            Label(max(each.start_s, start_s) + shift_s, min(each.end_s, stop_s) + shift_s, each.terrain)
-            for each in run.labels
-            if each.start_s < stop_s and each.end_s > start_s
-        ]
-        end_s = shift_s + stop_s
-    return replace(first, streams=streams, labels=tuple(labels))

@@ -245,12 +245,7 @@ def frame_coefficient(pose: Array, wheels_mps: Array, period_s: float) -> tuple[
     return float(fitted[0]), float(np.sqrt(variance[0, 0]))
 
 
-def is_first_pose(coefficient: float, std: float) -> bool:
-    """Return whether positions are in the frame of the first pose: a is 0 beyond doubt, and -1 is not.
-
-    Examples
-    --------
-    >>> is_first_pose(0.13, 0.17), is_first_pose(-0.9, 0.13), is_first_pose(-0.4, 0.3)
-    (True, False, False)
-    """
+def is_first_pose(pose: Array, wheels_mps: Array, period_s: float) -> bool:
+    """Return whether positions are in the frame of the first pose: a is 0 beyond doubt, and -1 is not."""
+    coefficient, std = frame_coefficient(pose, wheels_mps, period_s)
     return bool(abs(coefficient) < 3.0 * std and coefficient + 1.0 > 3.0 * std)

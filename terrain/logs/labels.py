@@ -140,7 +140,7 @@ def set_label(
     given.  ``ConfigError`` where there is no such run, or the interval is outside of it; ``LogError`` where it is
     damaged.
     """
-    folder = folder_of(run_id, labelled_folders(data), data)
+    (folder,) = run_folders_of(data, run_id)
     run = read_run(folder, repair=True)
     streams = run.streams.values()
     first_s = min(float(stream.time_s[0]) for stream in streams)
@@ -181,32 +181,24 @@ def relabelled(labels: Iterable[Label], start_s: float, end_s: float, terrain: s
     return _joined(sorted(kept))
 
 
-def label_over(labels: Sequence[Label], start_s: float, end_s: float) -> str | None:
-    """Return the terrain of the label that covers an interval; None where none covers all of it."""
-    for label in labels:
-        if label.start_s - TIME_TOLERANCE_S <= start_s and end_s <= label.end_s + TIME_TOLERANCE_S:
-            return label.terrain
-    return None
+def run_folders_of(data: Path, run_id: str | None = None) -> list[Path]:
+    """Return the run folders under a folder, which are the ones that labels can be set of, or the one of a run.
 
-
-def labelled_folders(data: Path) -> list[Path]:
-    """Return the run folders under a folder, which are the ones that labels can be set of; none is refused."""
+    None is refused, and so are several of one run.
+    """
     if not data.is_dir():
         raise LogError(f"{data}: {'is no folder' if data.exists() else 'does not exist'}")
     folders = run_folders(data)
     if not folders:
         raise LogError(f"{data}: holds no run folder (run.json); 'terrain convert' makes them of other logs")
-    return folders
-
-
-def folder_of(run_id: str, folders: Sequence[Path], data: Path) -> Path:
-    """Return the one folder of a run; none and several are refused."""
+    if run_id is None:
+        return folders
     named = [folder for folder in folders if read_run_head(folder).run_id == run_id]
     if len(named) > 1:
         raise LogError(f"{data}: {len(named)} runs have the id {run_id!r}")
     if not named:
         raise ConfigError(f"{data}: there is no run {run_id!r}")
-    return named[0]
+    return named
 
 
 def windows_text(windows: Iterable[RecordedWindow]) -> str:
@@ -233,21 +225,20 @@ def doubtful_windows(
     data: Path, run_id: str | None = None
 ) -> tuple[tuple[RunWindows, ...], tuple[DoubtfulWindow, ...]]:
     """Return the windows whose outputs do not count, of all runs or of one, and how many each run has."""
-    folders = labelled_folders(data)
-    if run_id is not None:
-        folders = [folder_of(run_id, folders, data)]
     runs: list[RunWindows] = []
     doubtful: list[DoubtfulWindow] = []
-    for folder in folders:
+    for folder in run_folders_of(data, run_id):
         head, windows = read_run_head(folder), read_windows(folder)
         labels = head.checked_labels(short_name(folder / "run.json"))
-        rows = [
-            DoubtfulWindow(head.run_id, w.start_s, w.end_s, w.terrain, w.probability, w.refused, label)
-            for w in windows or ()
-            if w.doubtful
-            for label in [label_over(labels, w.start_s, w.end_s)]
-        ]
+        n_doubtful = n_bare = 0
+        for w in windows or ():
+            if w.doubtful:
+                first_s, last_s = w.start_s + TIME_TOLERANCE_S, w.end_s - TIME_TOLERANCE_S
+                over = [each.terrain for each in labels if each.start_s <= first_s and last_s <= each.end_s]
+                label = over[0] if over else None  # that covers all of it
+                about = (w.start_s, w.end_s, w.terrain, w.probability, w.refused, label)
+                doubtful.append(DoubtfulWindow(head.run_id, *about))
+                n_doubtful, n_bare = n_doubtful + 1, n_bare + (label is None)
         n_windows = None if windows is None else len(windows)
-        runs.append(RunWindows(head.run_id, n_windows, len(rows), sum(row.label is None for row in rows)))
-        doubtful += rows
+        runs.append(RunWindows(head.run_id, n_windows, n_doubtful, n_bare))
     return tuple(runs), tuple(doubtful)

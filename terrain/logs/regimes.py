@@ -12,20 +12,16 @@ def regime_of(run: RunLog) -> str:
 
     As ``speed_x_mps 0.1, yaw_rate_radps 0``.
     """
-    for name, decimals in (("commands", 3), ("wheels", 1)):
-        stream = run.streams.get(name)
-        if stream is None:
+    for name, prefix, decimals in (("commands", "", 3), ("wheels", "speed_", 1)):
+        if (stream := run.streams.get(name)) is None:
             continue
-        chosen = [
-            i for i, channel in enumerate(stream.channels) if name == "commands" or channel[:6] == "speed_"
-        ]
+        chosen = [i for i, channel in enumerate(stream.channels) if channel.startswith(prefix)]
         values = stream.values[:, chosen]
         if not chosen or not np.isfinite(values).any(axis=0).all():
             continue
-        if name == "commands" and np.nanmax(np.ptp(values, axis=0)) > 10.0**-decimals:
-            continue
-        means = [round(float(mean), decimals) + 0.0 for mean in np.nanmean(values, axis=0)]
-        return ", ".join(f"{stream.channels[i]} {mean:g}" for i, mean in zip(chosen, means, strict=True))
+        if name == "wheels" or np.nanmax(np.ptp(values, axis=0)) <= 10.0**-decimals:
+            means = [round(float(mean), decimals) + 0.0 for mean in np.nanmean(values, axis=0)]
+            return ", ".join(f"{stream.channels[i]} {mean:g}" for i, mean in zip(chosen, means, strict=True))
     return run.run_id
 
 
@@ -35,10 +31,10 @@ def driven_at(run: RunLog, low_mps: float, high_mps: float) -> bool:
     if commands is not None and "speed_x_mps" in commands.channels:
         parts = [name for name in ("speed_x_mps", "speed_y_mps") if name in commands.channels]
         speed = np.linalg.norm(np.column_stack([commands.channel(name) for name in parts]), axis=1)
-    elif wheels is not None and any(name.startswith("speed_") for name in wheels.channels):
-        chosen = [name for name in wheels.channels if name.startswith("speed_")]
-        speed = np.abs(np.column_stack([wheels.channel(name) for name in chosen])).mean(axis=1)
     else:
-        return False
+        names = [] if wheels is None else [name for name in wheels.channels if name.startswith("speed_")]
+        if wheels is None or not names:
+            return False
+        speed = np.abs(np.column_stack([wheels.channel(name) for name in names])).mean(axis=1)
     known = speed[np.isfinite(speed)]
     return bool(known.size and low_mps <= known.mean() <= high_mps)

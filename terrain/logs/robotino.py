@@ -35,10 +35,9 @@ What is assumed here was compared with the other columns:
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -46,10 +45,17 @@ from terrain.errors import LogError
 from terrain.files.documents import read_json
 from terrain.files.names import normal_name, shown
 from terrain.logs.replay import TWIST
-from terrain.logs.samples import check_log_file, checked_names, checked_stream, short_name, whole_run_label
+from terrain.logs.samples import (
+    check_log_file,
+    checked_names,
+    checked_stream,
+    refuse_or_count,
+    short_name,
+    whole_run_label,
+)
 from terrain.logs.schema import POSE_CHANNELS, WHEELS_CHANNELS
 from terrain.logs.tables import TextLayout, header_of, read_table, row_number
-from terrain.records import Array, RunLog, Stream
+from terrain.records import Array, RunLog
 
 CAMERA_FILE = "camera_params.json"
 
@@ -111,34 +117,6 @@ def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
     return [partial(read_run, path, root) for path in files]
 
 
-class _Log(NamedTuple):
-    """Columns of a file by name, what a repairing read drops of it (None refuses), and what any read changes."""
-
-    path: Path
-    table: dict[str, Array]
-    repairs: Counter[str] | None
-    converted: Counter[str]
-
-    def columns(self, names: Sequence[str]) -> Array:
-        return np.column_stack([self.table[name] for name in names])
-
-    def row(self, sample: int) -> int:
-        return row_number(self.path, sample, layout=_LAYOUT)
-
-    def stream(
-        self,
-        values: Array,
-        channels: Sequence[str],
-        columns: Sequence[str],
-        rows: slice | Array = slice(None),
-    ) -> Stream:
-        time_s = self.table["t"][rows] * 1e-3
-        name, repairs = short_name(self.path), self.repairs
-        return checked_stream(
-            name, time_s, values, channels, row_of=self.row, columns=columns, repairs=repairs
-        )
-
-
 def read_run(path: Path, root: Path, *, repair: bool = False) -> RunLog:
     """Return the run that a ``.csv.gz`` of the data set in ``root`` holds.
 
@@ -150,50 +128,69 @@ def read_run(path: Path, root: Path, *, repair: bool = False) -> RunLog:
         motion while the wheels turn.
     """
     path = check_log_file(path, root)
-    parts = path.relative_to(root).parts
+    name, parts = short_name(path), path.relative_to(root).parts
     repairs = Counter[str]() if repair else None
     with_camera = parts[0] != _MOTORS_ONLY or _POSE[0] in header_of(path, _LAYOUT)
     names = ["t", *_SET_RATES, *_COUNTS, *_RATES, *_CURRENTS, *((*_TWIST, *_POSE) if with_camera else ())]
     table = dict(zip(names, read_table(path, names, layout=_LAYOUT, repairs=repairs).T, strict=True))
-    log = _Log(path, table, repairs, Counter())
-    streams = {"wheels": _wheels(log)}
+    row_of = partial(row_number, path, layout=_LAYOUT)
+    checked = partial(checked_stream, name, row_of=row_of, repairs=repairs)
+    set_rates, counts, rates, currents, twist, seen = (
+        np.column_stack([table[each] for each in group]) if group[0] in table else np.zeros((0, 3))
+        for group in (_SET_RATES, _COUNTS, _RATES, _CURRENTS, _TWIST, _POSE)
+    )
+    time_s = table["t"] * 1e-3
+    for rate, count in zip(rates.T, counts.T, strict=True):
+        rate *= _scale(time_s, rate, count)
+    converted = Counter({SCALED: len(_RATES), NO_SIGN: len(_CURRENTS)})
+    motors = np.column_stack([rates, currents])
+    streams = {"wheels": checked(time_s, motors, WHEELS_CHANNELS, columns=[*_RATES, *_CURRENTS])}
     if with_camera:
-        streams["commands"] = _commands(log)
-        if (pose := _pose(log, read_camera(root))) is not None:
-            streams["pose"] = pose
+        # commanded motor speeds are those of terrain.kinematics.wheels.rolling_matrix
+        direction = np.radians([150.0, 270.0, 390.0])
+        rolling = np.stack([np.cos(direction), np.sin(direction), np.full(3, _WHEEL_DISTANCE_M)], axis=-1)
+        expected = np.nan_to_num(twist) @ (rolling * (_GEAR / _WHEEL_RADIUS_M)).T
+        apart = np.nanmax(np.abs(set_rates - expected), axis=1, initial=0.0)
+        for row in np.flatnonzero(apart > MAX_COMMAND_ERROR_RADPS)[:1].tolist():
+            raise LogError(
+                f"{name}: at row {row_of(row)} the commanded motor speeds are {apart[row]:.3g} rad/s away from "
+                f"those of the commanded twist; at most {MAX_COMMAND_ERROR_RADPS:g} rad/s are accepted (are they "
+                "of another robot or session?)"
+            )
+        streams["commands"] = checked(time_s, twist, TWIST, columns=_TWIST)
+        metres = read_camera(root)
+        new = np.asarray(np.isfinite(seen).all(axis=1))
+        new[1:] &= (np.diff(seen, axis=0) != 0.0).any(axis=1)
+        moves = any(np.ptp(count[np.isfinite(count)]) >= MIN_TICKS for count in counts.T)
+        if moves and new.sum() < MIN_POSES:
+            fault = f"the camera shows {int(new.sum())} different poses while the wheels turn"
+            refuse_or_count(repairs, BLIND, f"{name}: {fault}; at least {MIN_POSES} are required")
+        else:
+            converted[HELD] += int((~new).sum())
+            yaw = np.unwrap(np.radians(seen[new, 2])) + np.pi / 2
+            pose = np.column_stack([seen[new, 0] * metres[0], -seen[new, 1] * metres[1], yaw])
+            streams["pose"] = checked(time_s[new], pose, POSE_CHANNELS, columns=_POSE)
     run_id, terrain, session = _names(parts)
     labels = (whole_run_label({"wheels": streams["wheels"]}, terrain),) if terrain else ()
-    source, dropped = f"{'/'.join(parts)}, Robotino layout", log.converted + (repairs or Counter())
-    run = RunLog(run_id, "robotino", streams, labels, source, dropped, session)
-    return checked_names(short_name(path), run)
+    source, dropped = f"{'/'.join(parts)}, Robotino layout", converted + (repairs or Counter())
+    return checked_names(name, RunLog(run_id, "robotino", streams, labels, source, dropped, session))
 
 
-def read_camera(root: Path) -> tuple[float, float]:
+def read_camera(root: Path) -> list[float]:
     """Return the metres a pixel, in x and y, of the camera of a data set.
 
     ``LogError`` where the file is missing, no JSON, or lacks a scale above zero.
     """
     path = root / CAMERA_FILE
     place = short_name(path)
-    described = read_json(check_log_file(path, root), place, LogError)
+    document = read_json(check_log_file(path, root), place, LogError)
     scales = []
-    for axis in "xy":
-        value = described.get(f"pixel_resolution_{axis}") if isinstance(described, dict) else None
+    for key in ("pixel_resolution_x", "pixel_resolution_y"):
+        value = document.get(key) if isinstance(document, dict) else None
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < np.inf:
-            raise LogError(
-                f"{place}: pixel_resolution_{axis} is {shown(value)}, millimetres a pixel are required"
-            )
+            raise LogError(f"{place}: {key} is {shown(value)}, millimetres a pixel are required")
         scales.append(float(value) * 1e-3)
-    return scales[0], scales[1]
-
-
-def _wheels(log: _Log) -> Stream:
-    rates, counts = log.columns(_RATES), log.columns(_COUNTS)
-    for rate, count in zip(rates.T, counts.T, strict=True):
-        rate *= _scale(log.table["t"] * 1e-3, rate, count)
-    log.converted.update({SCALED: len(_RATES), NO_SIGN: len(_CURRENTS)})
-    values = np.column_stack([rates, log.columns(_CURRENTS)])
-    return log.stream(values, WHEELS_CHANNELS, [*_RATES, *_CURRENTS])
+    return scales
 
 
 def _scale(time_s: Array, rate_radps: Array, counts: Array) -> float:
@@ -204,47 +201,9 @@ def _scale(time_s: Array, rate_radps: Array, counts: Array) -> float:
     time_s, rate_radps = time_s[known], rate_radps[known]
     angle = counts[known] * (2.0 * np.pi / _TICKS_PER_TURN)
     turned = np.concatenate([[0.0], np.cumsum(np.diff(time_s) * (rate_radps[1:] + rate_radps[:-1]) / 2.0)])
-    turned = turned - turned.mean()
+    turned -= turned.mean()
     slope = float(turned @ angle / (turned @ turned))
     return slope if abs(slope / USUAL_SCALE - 1.0) < MAX_SCALE_ERROR else USUAL_SCALE
-
-
-def _commands(log: _Log) -> Stream:
-    """Return the commanded twist; motor speeds that are not those of it are refused.
-
-    The motor speeds are those of :func:`terrain.kinematics.wheels.rolling_matrix`.
-    """
-    twist, direction = log.columns(_TWIST), np.radians([150.0, 270.0, 390.0])
-    rolling = np.stack([np.cos(direction), np.sin(direction), np.full(3, _WHEEL_DISTANCE_M)], axis=-1)
-    expected = np.nan_to_num(twist) @ (rolling * (_GEAR / _WHEEL_RADIUS_M)).T
-    apart = np.nanmax(np.abs(log.columns(_SET_RATES) - expected), axis=1, initial=0.0)
-    for row in np.flatnonzero(apart > MAX_COMMAND_ERROR_RADPS)[:1].tolist():
-        raise LogError(
-            f"{short_name(log.path)}: at row {log.row(row)} the commanded motor speeds are {apart[row]:.3g} "
-            f"rad/s away from those of the commanded twist; at most {MAX_COMMAND_ERROR_RADPS:g} rad/s are "
-            "accepted (are they of another robot or session?)"
-        )
-    return log.stream(twist, TWIST, _TWIST)
-
-
-def _pose(log: _Log, metres: tuple[float, float]) -> Stream | None:
-    """Return the poses that are new; None where a repairing read has none while the wheels turn."""
-    seen, counts = log.columns(_POSE), log.columns(_COUNTS)
-    new = np.asarray(np.isfinite(seen).all(axis=1))
-    new[1:] &= (np.diff(seen, axis=0) != 0.0).any(axis=1)
-    moves = any(np.ptp(count[np.isfinite(count)]) >= MIN_TICKS for count in counts.T)
-    if moves and new.sum() < MIN_POSES:
-        if log.repairs is None:
-            raise LogError(
-                f"{short_name(log.path)}: the camera shows {int(new.sum())} different poses while the wheels "
-                f"turn; at least {MIN_POSES} are required"
-            )
-        log.repairs[BLIND] += 1
-        return None
-    log.converted[HELD] += int((~new).sum())
-    yaw = np.unwrap(np.radians(seen[new, 2])) + np.pi / 2
-    pose = np.column_stack([seen[new, 0] * metres[0], -seen[new, 1] * metres[1], yaw])
-    return log.stream(pose, POSE_CHANNELS, _POSE, new)
 
 
 def _names(parts: tuple[str, ...]) -> tuple[str, str, str]:

@@ -14,7 +14,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple, Protocol
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field
@@ -66,12 +66,6 @@ class StreamTopic(BaseModel):
     kind: str = Field(validation_alias=AliasChoices("type", "kind"), serialization_alias="type")
     fields: Annotated[dict[str, str], Field(min_length=1)]
 
-    @property
-    def definition(self) -> str:
-        """Definition of its messages, in the language of ``.msg`` files."""
-        lines = ["std_msgs/Header header", *(f"float64 {field}" for field in (TIME_FIELD, *self.fields))]
-        return "\n".join(lines) + "\n" + HEADER_TEXT
-
 
 class Messages(NamedTuple):
     """Messages of a topic: its name and type, the text that defines it, log times (n,) in ns, and contents."""
@@ -102,26 +96,24 @@ def stream_topic(stream: str, channels: Sequence[str], taken: Iterable[StreamTop
     >>> stream_topic("imu", ("gyro_z_radps",))
     StreamTopic(topic='/terrain/imu', kind='terrain_msgs/msg/Imu', fields={'gyro_z_radps': 'gyro_z_radps'})
     """
+
+    def accepted_names(names: Iterable[str], fallback: str, reserved: Iterable[str]) -> list[str]:
+        """Return a name for each, as ROS accepts them: lower-case letters, digits and single underlines."""
+        used, found = {each.replace("_", "") for each in reserved}, []
+        for number, name in enumerate(names):
+            plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+            plain = plain if re.match(r"[a-z]", plain) else f"{fallback}_{number}"
+            while plain.replace("_", "") in used:
+                plain = f"{plain}_{number}"
+            used.add(plain.replace("_", ""))
+            found.append(plain)
+        return found
+
     others = [each.topic.removeprefix(PREFIX) for each in taken]
-    (name,) = _accepted_names([stream], f"stream_{len(others)}", [*RESERVED, *others])
-    fields = _accepted_names(channels, "channel", (TIME_FIELD, "header"))
-    kind = "".join(part.capitalize() for part in name.split("_"))
-    return StreamTopic(
-        topic=PREFIX + name, kind=f"{PACKAGE}/msg/{kind}", fields=dict(zip(fields, channels, strict=True))
-    )
-
-
-def _accepted_names(names: Iterable[str], fallback: str, reserved: Iterable[str]) -> list[str]:
-    """Return a name for each, as ROS accepts them: lower-case letters, digits and single underlines."""
-    taken, accepted_names = {each.replace("_", "") for each in reserved}, []
-    for number, name in enumerate(names):
-        plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
-        plain = plain if re.match(r"[a-z]", plain) else f"{fallback}_{number}"
-        while plain.replace("_", "") in taken:
-            plain = f"{plain}_{number}"
-        taken.add(plain.replace("_", ""))
-        accepted_names.append(plain)
-    return accepted_names
+    (name,) = accepted_names([stream], f"stream_{len(others)}", [*RESERVED, *others])
+    fields = dict(zip(accepted_names(channels, "channel", (TIME_FIELD, "header")), channels, strict=True))
+    kind = f"{PACKAGE}/msg/{''.join(part.capitalize() for part in name.split('_'))}"
+    return StreamTopic(topic=PREFIX + name, kind=kind, fields=fields)
 
 
 class RunDocument(RunHead):
@@ -133,18 +125,6 @@ class RunDocument(RunHead):
     version: Literal[1] = 1
     live: bool = False
     streams: Annotated[dict[str, StreamTopic], Field(min_length=1, max_length=MAX_STREAMS)]
-
-
-def run_document(head: RunHead, topics: Mapping[str, StreamTopic], *, live: bool = False) -> str:
-    """Return the text of a document."""
-    document = RunDocument(**dict(head), live=live, streams=dict(topics))
-    return json.dumps(document.model_dump(by_alias=True), allow_nan=False)
-
-
-def string_message(text: str) -> bytes:
-    """Return a message of ``std_msgs/String``."""
-    content = text.encode() + b"\0"
-    return struct.pack("<4BI", 0, 1, 0, 0, len(content)) + content
 
 
 def string_of(place: str, message: bytes) -> str:
@@ -174,7 +154,8 @@ def text_messages(
 ) -> Messages:
     """Return texts at times of a run as messages; times outside what stamps can be are its ends."""
     known_s = np.clip(np.nan_to_num(time_s, nan=origin_s), origin_s, origin_s + LATEST_S)
-    contents = [string_message(text) for text in texts]
+    coded = [text.encode() + b"\0" for text in texts]
+    contents = [struct.pack("<4BI", 0, 1, 0, 0, len(each)) + each for each in coded]
     return Messages(topic, STRING, STRING_TEXT, stamps_ns(known_s, origin_s), contents)
 
 
@@ -195,9 +176,9 @@ def stream_messages(
     records["sec"], records["nanosec"] = log_ns // 10**9, log_ns % 10**9
     records["frame_bytes"] = 1
     records["numbers"][:, 0], records["numbers"][:, 1:] = time_s, numbers
-    packed, size = records.tobytes(), records.dtype.itemsize
-    contents = [packed[start : start + size] for start in range(0, len(packed), size)]
-    return Messages(topic.topic, topic.kind, topic.definition, log_ns, contents)
+    lines = ["std_msgs/Header header", *(f"float64 {field}" for field in (TIME_FIELD, *topic.fields))]
+    definition = "\n".join(lines) + "\n" + HEADER_TEXT
+    return Messages(topic.topic, topic.kind, definition, log_ns, [record.tobytes() for record in records])
 
 
 def origin_of(run: RunLog) -> float:
@@ -208,62 +189,20 @@ def origin_of(run: RunLog) -> float:
     first_s = min(float(stream.time_s[0]) for stream in run.streams.values())
     last_s = max(float(stream.time_s[-1]) for stream in run.streams.values())
     if last_s - first_s > LATEST_S - 1:
-        raise DataError(
-            f"run {shown(run.run_id)} is {last_s - first_s:g} s long, stamps have {LATEST_S} s at most"
-        )
+        most = f"stamps have {LATEST_S} s at most"
+        raise DataError(f"run {shown(run.run_id)} is {last_s - first_s:g} s long, {most}")
     return 0.0 if first_s >= 0.0 and last_s <= LATEST_S else float(np.floor(first_s))
 
 
-def run_messages(run: RunLog, windows: Sequence[tuple[float, str]] = ()) -> Iterator[Messages]:
-    """Yield the topics of a run: its document, its labels, what was recorded with it, and its streams.
-
-    ``windows`` are time of the end and description of each window that was recorded with it.
-    """
-    origin_s = origin_of(run)
-    start_s = min(float(stream.time_s[0]) for stream in run.streams.values())
-    topics: dict[str, StreamTopic] = {}
-    for name, stream in run.streams.items():
-        topics[name] = stream_topic(name, stream.channels, topics.values())
-    document = run_document(RunHead.of(run), topics)
-    yield text_messages(RUN_TOPIC, [start_s], [document], origin_s)
-    changes = label_changes(run.labels)
-    for topic, texts in ((LABEL_TOPIC, changes), (WINDOW_TOPIC, windows)):
-        if texts:
-            times_s, contents = zip(*texts, strict=True)
-            yield text_messages(topic, times_s, contents, origin_s)
-    for name, stream in run.streams.items():
-        values = np.column_stack([stream.channel(channel) for channel in topics[name].fields.values()])
-        yield stream_messages(topics[name], stream.time_s, values, origin_s)
-
-
-def stream_samples(place: str, topic: StreamTopic, messages: Sequence[bytes], faults: Faults) -> Array:
-    """Return the numbers (n, 1 + c) in messages of a stream: time in s, and a value a field."""
-    record = _record(len(topic.fields))
-    whole = [each for each in messages if len(each) == record.itemsize and each[:4] == b"\0\1\0\0"]
-    damaged = len(messages) - len(whole)
-    if damaged:
-        text = f"topic {shown(topic.topic)} has {damaged} messages that are not as defined"
-        faults.found(place, DAMAGED_MESSAGE, text, damaged)
-    numbers: Array = np.frombuffer(b"".join(whole), dtype=record)["numbers"]
-    return numbers
-
-
-class Writer(Protocol):
-    """Writes messages to a file, each with its log time."""
-
-    def write(self, of: Messages, log_ns: int, content: bytes) -> None: ...  # noqa: D102
-    def flush(self) -> None: ...  # noqa: D102
-    def finish(self) -> None: ...  # noqa: D102
-
-
 class RunRecorder:
-    """A run that is written as it comes: topics as those of a run that was exported.
+    """A run that is written message by message: topics as those of a run that was exported.
 
-    After :meth:`flush` all that was appended is in the file; if the process is killed then, readers read it.
+    ``writer`` has ``write(messages, log_ns, content)``, ``flush()`` and ``finish()``.  After :meth:`flush` all that was
+    appended is in the file; if the process is killed then, readers read it.
     ``origin_s`` is the time on the clock of the run that is stamped 0; stamps reach 68 years from there.
     """
 
-    def __init__(self, writer: Writer, head: RunHead, origin_s: float = 0.0) -> None:
+    def __init__(self, writer: Any, head: RunHead, origin_s: float = 0.0) -> None:
         self._writer, self._head, self._origin_s = writer, head, origin_s
         self._topics: dict[str, StreamTopic] = {}
         self._is_described, self._last_ns = False, 0
@@ -289,9 +228,8 @@ class RunRecorder:
         self._write(text_messages(topic, [time_s], [text], self._origin_s))
 
     def _describe(self, log_ns: int) -> None:
-        text = run_document(self._head, self._topics, live=True)
-        stamps_ns, contents = np.array([log_ns]), [string_message(text)]
-        self._write(Messages(RUN_TOPIC, STRING, STRING_TEXT, stamps_ns, contents))
+        document = _document(self._head, self._topics, live=True)
+        self._write(text_messages(RUN_TOPIC, [0.0], [document], 0.0)._replace(log_ns=np.array([log_ns])))
         self._is_described = True
 
     def _write(self, messages: Messages) -> None:
@@ -310,6 +248,32 @@ class RunRecorder:
         self._head = self._head.model_copy(update={"labels": entries, "dropped": counts})
         self._describe(self._last_ns)
         self._writer.finish()
+
+
+def _document(head: RunHead, topics: Mapping[str, StreamTopic], *, live: bool = False) -> str:
+    document = RunDocument(**dict(head), live=live, streams=dict(topics))
+    return json.dumps(document.model_dump(by_alias=True), allow_nan=False)
+
+
+def run_messages(run: RunLog, windows: Sequence[tuple[float, str]] = ()) -> Iterator[Messages]:
+    """Yield the topics of a run: its document, its labels, what was recorded with it, and its streams.
+
+    ``windows`` are time of the end and description of each window that was recorded with it.
+    """
+    origin_s = origin_of(run)
+    start_s = min(float(stream.time_s[0]) for stream in run.streams.values())
+    topics: dict[str, StreamTopic] = {}
+    for name, stream in run.streams.items():
+        topics[name] = stream_topic(name, stream.channels, topics.values())
+    yield text_messages(RUN_TOPIC, [start_s], [_document(RunHead.of(run), topics)], origin_s)
+    changes = label_changes(run.labels)
+    for topic, texts in ((LABEL_TOPIC, changes), (WINDOW_TOPIC, windows)):
+        if texts:
+            times_s, contents = zip(*texts, strict=True)
+            yield text_messages(topic, times_s, contents, origin_s)
+    for name, stream in run.streams.items():
+        values = np.column_stack([stream.channel(channel) for channel in topics[name].fields.values()])
+        yield stream_messages(topics[name], stream.time_s, values, origin_s)
 
 
 def read_document(place: str, text: str, topics: Mapping[str, Topic]) -> RunDocument:
@@ -353,59 +317,46 @@ def run_of(
     dropped = Counter(document.dropped)
     streams: dict[str, Stream] = {}
     for name, topic in document.streams.items():
-        numbers = stream_samples(place, topic, messages.get(topic.topic, ()), faults)
-        channels = tuple(topic.fields.values())
-        if document.live:
-            recorded = _recorded_stream(name, channels, numbers, dropped)
-            streams |= {name: recorded} if recorded is not None else {}
+        record, all_of = _record(len(topic.fields)), messages.get(topic.topic, ())
+        whole = [each for each in all_of if len(each) == record.itemsize and each[:4] == b"\0\1\0\0"]
+        if damaged := len(all_of) - len(whole):
+            text = f"topic {shown(topic.topic)} has {damaged} messages that are not as defined"
+            faults.found(place, DAMAGED_MESSAGE, text, damaged)
+        numbers = np.frombuffer(b"".join(whole), dtype=record)["numbers"]
+        try:
+            stream = checked_stream(
+                f"{place}: stream {shown(name)}",
+                numbers[:, 0],
+                numbers[:, 1:],
+                tuple(topic.fields.values()),
+                repairs=dropped if document.live else faults.repairs,
+                unknown_is_a_value=document.live or name in MAY_BE_UNKNOWN,
+            )
+        except LogError:
+            if not document.live:
+                raise
+            dropped[SHORT_STREAM] += 1
             continue
-        streams[name] = checked_stream(
-            f"{place}: stream {shown(name)}",
-            numbers[:, 0],
-            numbers[:, 1:],
-            channels,
-            repairs=faults.repairs,
-            unknown_is_a_value=name in MAY_BE_UNKNOWN,
-        )
-    if document.live:
-        streams = _overlapping(streams, dropped)
+        alive = np.isfinite(stream.values).any(axis=0)
+        if document.live and name != "control" and not alive.all():  # figures of a decision may be unknown
+            dropped[DEAD_CHANNEL] += int((~alive).sum())
+            if not alive.any():
+                dropped[DEAD_STREAM] += 1
+                continue
+            channels = tuple(stream.channels[i] for i in np.flatnonzero(alive))
+            stream = Stream(stream.time_s, stream.values[:, alive], channels)
+        streams[name] = stream
+    if document.live:  # the longest streams that have an instant in common, as the readers require
+        start_s, end_s, together = -np.inf, np.inf, dict[str, Stream]()
+        for name in sorted(streams, key=lambda name: (name in DECIDED, -streams[name].duration_s)):
+            latest_s = max(start_s, streams[name].time_s[0])
+            earliest_s = min(end_s, streams[name].time_s[-1])
+            if latest_s < earliest_s:
+                start_s, end_s, together[name] = latest_s, earliest_s, streams[name]
+        if apart := len(streams) - len(together):
+            dropped[APART] += apart
+        streams = {name: stream for name, stream in streams.items() if name in together}
         if not streams:
             raise LogError(f"{place}: holds no stream of two samples or more")
     dropped.update(faults.repairs or {})
     return document.run(place, streams, dropped)
-
-
-def _recorded_stream(
-    name: str, channels: tuple[str, ...], numbers: Array, dropped: Counter[str]
-) -> Stream | None:
-    """Return the samples of a recorded stream in order of time, without channels that never had a value."""
-    try:
-        stream = checked_stream(
-            name, numbers[:, 0], numbers[:, 1:], channels, repairs=dropped, unknown_is_a_value=True
-        )
-    except LogError:
-        dropped[SHORT_STREAM] += 1
-        return None
-    alive = np.isfinite(stream.values).any(axis=0)
-    if name == "control" or alive.all():  # the figures of a decision may be unknown throughout
-        return stream
-    dropped[DEAD_CHANNEL] += int((~alive).sum())
-    if not alive.any():
-        dropped[DEAD_STREAM] += 1
-        return None
-    kept = tuple(channels[i] for i in np.flatnonzero(alive))
-    return Stream(stream.time_s, stream.values[:, alive], kept)
-
-
-def _overlapping(streams: Mapping[str, Stream], dropped: Counter[str]) -> dict[str, Stream]:
-    """Return the streams that have an instant in common, as the readers require: the longest ones."""
-    start_s, end_s, kept = -np.inf, np.inf, set()
-    for name in sorted(streams, key=lambda name: (name in DECIDED, -streams[name].duration_s)):
-        stream = streams[name]
-        latest_s, earliest_s = max(start_s, stream.time_s[0]), min(end_s, stream.time_s[-1])
-        if latest_s < earliest_s:
-            start_s, end_s = latest_s, earliest_s
-            kept.add(name)
-    if len(kept) < len(streams):
-        dropped[APART] += len(streams) - len(kept)
-    return {name: stream for name, stream in streams.items() if name in kept}

@@ -40,15 +40,15 @@ class Part(NamedTuple):
 
 def stretches_of(part: Part, rng: np.random.Generator) -> list[Part]:
     """Cut a part of a run into stretches of random lengths without remainder; none where it is too short."""
-    found = []
+    stretches = []
     start_s, left_s = part.start_s, part.end_s - part.start_s
     while left_s >= SHORTEST_S:
         length_s = float(rng.uniform(SHORTEST_S, LONGEST_S))
         if left_s - length_s < SHORTEST_S:
             length_s = left_s if left_s <= LONGEST_S else left_s / 2
-        found.append(part._replace(start_s=start_s, end_s=start_s + length_s))
+        stretches.append(part._replace(start_s=start_s, end_s=start_s + length_s))
         start_s, left_s = start_s + length_s, left_s - length_s
-    return found
+    return stretches
 
 
 def order_stretches(stretches: Sequence[Part], rng: np.random.Generator) -> list[Part]:
@@ -60,18 +60,18 @@ def order_stretches(stretches: Sequence[Part], rng: np.random.Generator) -> list
     waiting: dict[str, list[Part]] = {}
     for i in rng.permutation(len(stretches)):
         waiting.setdefault(stretches[i].terrain, []).append(stretches[i])
-    found: list[Part] = []
-    while True:
-        last = found[-1].terrain if found else ""
-        names = sorted(name for name, kept in waiting.items() if kept and name != last)
-        if not names:
-            return found
-        counts = Counter({name: len(waiting[name]) for name in names})
-        n_left = sum(len(kept) for kept in waiting.values())
-        most, n_most = counts.most_common(1)[0]
-        weights = np.array([counts[name] for name in names], dtype=float)
-        chosen = most if 2 * n_most > n_left else names[rng.choice(len(names), p=weights / weights.sum())]
-        found.append(waiting[chosen].pop())
+    ordered: list[Part] = []
+    last = ""
+    while names := sorted(name for name, parts in waiting.items() if parts and name != last):
+        n_of = {name: len(waiting[name]) for name in names}
+        most = max(n_of, key=lambda name: n_of[name])
+        if 2 * n_of[most] > sum(map(len, waiting.values())):
+            last = most
+        else:
+            weights = np.array([*n_of.values()], dtype=float)
+            last = names[rng.choice(len(names), p=weights / weights.sum())]
+        ordered.append(waiting[last].pop())
+    return ordered
 
 
 def parts_under(runs: Mapping[str, RunLog], windows: Windows) -> list[Part]:
@@ -81,9 +81,8 @@ def parts_under(runs: Mapping[str, RunLog], windows: Windows) -> list[Part]:
     for name in np.unique(run_id):
         for label in runs[name].labels:
             begins_s = windows.start_s[(run_id == name) & (terrain == label.terrain)]
-            inside = (begins_s >= label.start_s - TIME_TOLERANCE_S) & (begins_s < label.end_s)
-            if inside.any():
-                begins_s = begins_s[inside]
+            begins_s = begins_s[(begins_s >= label.start_s - TIME_TOLERANCE_S) & (begins_s < label.end_s)]
+            if begins_s.size:
                 end_s = float(begins_s.max()) + windows.length_s
                 parts.append(Part(runs[name], float(begins_s.min()), end_s, label.terrain))
     return parts
@@ -131,16 +130,15 @@ def splice_runs(parts: Sequence[Part], channels: Mapping[str, Sequence[str]], ru
     """
     if not parts:
         raise DataError(f"{run_id}: there is no part to splice")
-    begins_s = np.concatenate(([0.0], np.cumsum([part.end_s - part.start_s for part in parts])))
+    begins_s = np.concatenate(([0.0], np.cumsum([part.end_s - part.start_s for part in parts]))).tolist()
     streams = {name: _spliced(parts, begins_s, name, tuple(names)) for name, names in channels.items()}
-    labels = tuple(
-        Label(float(begin_s), float(end_s), part.terrain)
-        for part, begin_s, end_s in zip(parts, begins_s, begins_s[1:], strict=False)
-    )
+    labels = tuple(map(Label, begins_s, begins_s[1:], [part.terrain for part in parts]))
     return RunLog(run_id, parts[0].run.robot, streams, labels, source="spliced from parts of runs")
 
 
-def _spliced(parts: Sequence[Part], begins_s: Array, name: str, channels: tuple[str, ...]) -> Stream:
+def _spliced(
+    parts: Sequence[Part], begins_s: Sequence[float], name: str, channels: tuple[str, ...]
+) -> Stream:
     times: list[Array] = []
     values: list[Array] = []
     before_s = -np.inf

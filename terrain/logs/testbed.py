@@ -40,7 +40,7 @@ import numpy as np
 
 from terrain.errors import LogError
 from terrain.files.names import shown
-from terrain.logs.samples import check_log_file, checked_names, checked_stream, short_name
+from terrain.logs.samples import check_log_file, checked_names, checked_stream, refuse_or_count, short_name
 from terrain.logs.tables import number_in, text_rows
 from terrain.records import Label, RunLog
 
@@ -77,7 +77,6 @@ SPREADS: dict[str, tuple[str, float]] = {
 }
 """Column and factor of each channel; a mean has to be there, a spread may be missing."""
 
-COLUMNS = tuple(column for column, _ in (*MEANS.values(), *SPREADS.values()))
 MAX_SLIP_MISFIT = 0.01
 """By how much ``slip`` may differ from the slip of the mean speeds; 0.002 is the most that was measured."""
 
@@ -95,25 +94,22 @@ def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
         path = folder / f"{wheel}.csv"
         if not path.is_file():
             continue
-        rows = text_rows(check_log_file(path, folder), COLUMNS)
+        columns = [column for column, _ in (MEANS | SPREADS).values()]
+        rows = text_rows(check_log_file(path, folder), columns)
         if not rows:
             raise LogError(f"{short_name(path)}: has no rows of data, a trial a row is needed")
         first: dict[tuple[str, ...], int] = {}
         for index, (row, cells) in enumerate(rows, start=1):
-            repeated = row if cells is None else first.setdefault(cells, row)
-            readers.append(partial(read_trial, short_name(path), wheel, index, row, cells, repeated))
+            fault = "has missing or extra cells"
+            if cells is not None and (same := first.setdefault(cells, row)):
+                fault = "" if same == row else f"repeats the trial of row {same}, number for number"
+            trial = dict(zip(columns, cells or (), strict=False))
+            readers.append(partial(read_trial, short_name(path), wheel, index, row, trial, fault))
     return readers
 
 
 def read_trial(
-    name: str,
-    wheel: str,
-    index: int,
-    row: int,
-    cells: tuple[str, ...] | None,
-    repeated: int,
-    *,
-    repair: bool = False,
+    name: str, wheel: str, index: int, row: int, cells: dict[str, str], fault: str, *, repair: bool = False
 ) -> RunLog:
     """Return a trial as a run.
 
@@ -121,63 +117,55 @@ def read_trial(
     ----------
     name, wheel : what messages call the file, and one of :data:`WHEELS`
     index, row : of the trial among the rows of data, from 1, and its number as an editor shows it
-    cells : its texts; None of a row that is too short or too long
-    repeated : number of the first row with these texts
+    cells : its texts by column
+    fault : of the whole row, empty without one
     repair : a spread that is not accepted becomes NaN and is counted
 
     Raises
     ------
     LogError
-        if the row is too short or too long or repeats another, a cell is no number, a mean is missing or not
-        finite, or the numbers contradict each other.
+        if the row has a fault, a cell is no number, a mean is missing or not finite, or the numbers contradict each
+        other.
     """
-    if cells is None:
-        raise LogError(f"{name}: row {row} has missing or extra cells")
-    if repeated != row:
-        raise LogError(f"{name}: row {row} repeats the trial of row {repeated}, number for number")
+    at = f"{name}: row {row}"
+    if fault:
+        raise LogError(f"{at} {fault}")
     dropped: Counter[str] = Counter()
     column = {}
-    for source, cell in zip(COLUMNS, cells, strict=True):
+    for source, cell in cells.items():
         place, number = f"{name}: {source} at row {row} is {shown(cell)}", number_in(cell)
         if source.startswith("std"):
             if number is None or not (math.isnan(number) or 0.0 <= number < math.inf):
-                if not repair:
-                    raise LogError(f"{place}, a standard deviation is a number from 0 up")
+                fault = f"{place}, a standard deviation is a number from 0 up"
+                refuse_or_count(dropped if repair else None, BAD_SPREAD, fault)
                 number = math.nan
-                dropped[BAD_SPREAD] += 1
         elif number is None:
             raise LogError(f"{place}, which is no number")
         elif not math.isfinite(number):
             raise LogError(f"{place}, a finite mean is required")
         column[source] = number
-    _refuse_contradictions(f"{name}: row {row}", column)
+    attempt, beta, travel = column["trial_num"], column["beta"], column["avg_Vx"]
+    slip = _slip(column["avg_Vry"], travel)
+    if attempt < 1 or attempt != int(attempt):
+        raise LogError(f"{at}: trial_num is {attempt:g}, a whole number from 1 up is required")
+    if not -90.0 <= beta <= 90.0:
+        raise LogError(f"{at}: beta is {beta:g} degrees, -90 to 90 is accepted")
+    if travel <= 0.0:
+        raise LogError(f"{at}: avg_Vx is {travel:g} mm/s, a speed of travel above 0 is required")
+    if abs(slip - column["slip"]) > MAX_SLIP_MISFIT:
+        raise LogError(f"{at}: slip is {column['slip']:g}, that of its mean speeds is {slip:.3f}")
+    if column["avg_Fz"] >= 0.0:
+        raise LogError(f"{at}: avg_Fz is {column['avg_Fz']:g} N, that of a wheel with a load is below 0")
     values = {channel: column[source] * factor for channel, (source, factor) in (MEANS | SPREADS).items()}
-    values["slip_commanded_ratio"] = slip_of(values["speed_wheel_commanded_mps"], TRAVEL_SPEED_MPS)
+    values["slip_commanded_ratio"] = _slip(values["speed_wheel_commanded_mps"], TRAVEL_SPEED_MPS)
     twice = np.tile([*values.values()], (2, 1))
     stream = checked_stream(name, np.array([0.0, HELD_S]), twice, [*values], unknown_is_a_value=True)
     labels = (Label(0.0, 2.0 * HELD_S, "dry_sand"),)
-    source = f"{name}, row {row}, layout of the wheel testbed"
-    run = RunLog(
-        f"{wheel}_trial_{index:03d}", f"testbed_{wheel}", {STREAM: stream}, labels, source, dropped, wheel
-    )
+    about = (labels, f"{name}, row {row}, layout of the wheel testbed", dropped, wheel)
+    run = RunLog(f"{wheel}_trial_{index:03d}", f"testbed_{wheel}", {STREAM: stream}, *about)
     return checked_names(name, run)
 
 
-def slip_of(wheel_mps: float, travel_mps: float) -> float:
-    """Return the slip ratio of two speeds of which one at least is not 0."""
-    return (wheel_mps - travel_mps) / max(abs(wheel_mps), abs(travel_mps))
-
-
-def _refuse_contradictions(place: str, column: dict[str, float]) -> None:
-    attempt, beta = column["trial_num"], column["beta"]
-    if attempt < 1 or attempt != int(attempt):
-        raise LogError(f"{place}: trial_num is {attempt:g}, a whole number from 1 up is required")
-    if not -90.0 <= beta <= 90.0:
-        raise LogError(f"{place}: beta is {beta:g} degrees, -90 to 90 is accepted")
-    if column["avg_Vx"] <= 0.0:
-        raise LogError(f"{place}: avg_Vx is {column['avg_Vx']:g} mm/s, a speed of travel above 0 is required")
-    slip = slip_of(column["avg_Vry"], column["avg_Vx"])
-    if abs(slip - column["slip"]) > MAX_SLIP_MISFIT:
-        raise LogError(f"{place}: slip is {column['slip']:g}, that of its mean speeds is {slip:.3f}")
-    if column["avg_Fz"] >= 0.0:
-        raise LogError(f"{place}: avg_Fz is {column['avg_Fz']:g} N, that of a wheel with a load is below 0")
+def _slip(wheel_mps: float, travel_mps: float) -> float:
+    fastest_mps = max(abs(wheel_mps), abs(travel_mps))
+    return (wheel_mps - travel_mps) / fastest_mps if fastest_mps else math.nan

@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.data.datasets import load_runs
 from terrain.errors import DataError
-from terrain.logs.duplicates import PrintFiles, groups_of, merge_runs, run_print, shared_stretches
+from terrain.logs.duplicates import groups_of, merge_runs, possible_pairs, run_print, shared_stretches
 from terrain.records import Label, RunLog, Stream
 
 
@@ -78,32 +78,28 @@ def test_a_copy_is_found_whatever_was_done_to_it(runs, kind):
     assert found.duration_s == pytest.approx(24.0, abs=1.0)
 
 
-def possible_pairs(runs):
-    """Return the pairs of runs whose prints, made run by run, have enough in common."""
-    with PrintFiles() as files:
-        for run in runs:
-            files.add(run_print(run))
-        return files.possible_pairs()
+def pairs_by_prints(runs):
+    return possible_pairs([run_print(run) for run in runs])
 
 
 @pytest.mark.parametrize("kind", list(CHANGES)[::2])
 def test_a_copy_is_found_by_the_prints_of_runs_alone(runs, kind):
-    assert possible_pairs(runs) == []
+    assert pairs_by_prints(runs) == []
     hidden = [changed(runs[5], CHANGES[kind]), cut(runs[2], 6.0, 12.0)]
-    assert possible_pairs([*runs, *hidden]) == [(2, 9), (5, 8)]
+    assert pairs_by_prints([*runs, *hidden]) == [(2, 9), (5, 8)]
 
 
 def test_short_runs_of_the_same_samples_are_found_by_their_bytes_and_missing_channels_have_none(runs):
     short = [cut(runs[0], 0.0, 2.0, name) for name in "ab"]
     assert len(run_print(short[0]).codes) < 6
-    assert possible_pairs([*short, runs[1]]) == [(0, 1)]
+    assert pairs_by_prints([*short, runs[1]]) == [(0, 1)]
     (found,) = shared_stretches(short)
     assert (found.first, found.second) == ("a", "b")
     still, lost = (
         changed(runs[0], lambda each, value=value: Stream(each.time_s, each.values * value, each.channels))
         for value in (0.0, np.nan)
     )
-    assert possible_pairs([still, still, lost, lost]) == possible_pairs([]) == []
+    assert pairs_by_prints([still, still, lost, lost]) == pairs_by_prints([]) == []
 
 
 @pytest.mark.parametrize("length_s", [6.0, 10.0, 18.0])

@@ -113,16 +113,17 @@ def windows(mean_of_five, n=150, seed=0, side_slip_s=0.15):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("mean_of_five", [True, False])
 def test_the_frame_of_positions_is_that_of_robots_that_change_their_turning(mean_of_five, seed):
-    coefficient, std = frame_coefficient(*windows(mean_of_five, seed=seed), PERIOD_S)
+    session = windows(mean_of_five, seed=seed)
+    coefficient, std = frame_coefficient(*session, PERIOD_S)
     assert abs(coefficient - (-1.0 if mean_of_five else 0.0)) < 4.0 * std < 0.8
-    assert is_first_pose(coefficient, std) is not mean_of_five
+    assert is_first_pose(*session, PERIOD_S) is not mean_of_five
 
 
 def test_robots_that_drive_straight_or_stand_do_not_show_it():
     pose, wheels = windows(False)
     pose[..., 1:] = 0.0
-    assert not is_first_pose(*frame_coefficient(pose, wheels, PERIOD_S))
-    assert not is_first_pose(*frame_coefficient(np.zeros((30, N, 3)), np.zeros((30, N, 2)), PERIOD_S))
+    assert not is_first_pose(pose, wheels, PERIOD_S)
+    assert not is_first_pose(np.zeros((30, N, 3)), np.zeros((30, N, 2)), PERIOD_S)
     assert np.isnan(frame_coefficient(*(each[:5] for each in windows(False)), PERIOD_S)).all()
 
 

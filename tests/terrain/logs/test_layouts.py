@@ -16,8 +16,7 @@ from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
 from terrain.files.names import data_folder
 from terrain.kinematics.wheels import rolling_matrix
-from terrain.logs.drive import STREAMS
-from terrain.logs.drive_recording import LOST, NOT_RECORDED, STILL
+from terrain.logs.drive import LOST, NOT_RECORDED, STILL, STREAMS
 from terrain.logs.imu_axes import GYRO_IN_DEGREES, GYRO_TURNED, NO_SIGN, POWER_SIGN, TURNED, current_sign
 from terrain.logs.mapping import load_mapping
 from terrain.logs.robotino import BLIND, HELD, SCALED
