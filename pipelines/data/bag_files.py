@@ -28,10 +28,10 @@ from terrain import errors
 from terrain.errors import LogError, TerrainError, one_line
 from terrain.files.documents import accepted, read_yaml
 from terrain.files.names import MEBIBYTE, shown
+from terrain.logs.mapping import DAMAGED_BLOCK, DISTRO, EARLY_END, Faults, Topic, short_type
 from terrain.logs.run_folders import RunHead
 from terrain.logs.run_topics import Messages
 from terrain.logs.samples import check_log_file, short_name
-from terrain.logs.topics import DAMAGED_BLOCK, DISTRO, EARLY_END, Faults, Topic, short_type
 
 if TYPE_CHECKING:
     from mcap.records import Chunk

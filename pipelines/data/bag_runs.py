@@ -10,8 +10,16 @@ from pathlib import Path
 from pipelines.data.bag_files import Bag, decoder_of, find_bags, messages_of, open_bag, topics_of
 from terrain.errors import ConfigError, LogError
 from terrain.kinematics.standard_messages import KINDS
-from terrain.logs.labels import RecordedWindow, window_of_text
-from terrain.logs.mapping import MessageStream, TopicMapping, load_topics
+from terrain.logs.mapping import (
+    Faults,
+    MappedTopics,
+    MessageStream,
+    Topic,
+    TopicMapping,
+    load_topics,
+    standard_mapping,
+)
+from terrain.logs.run_folders import RecordedWindow, window_of_text
 from terrain.logs.run_topics import (
     RUN_TOPIC,
     STRING,
@@ -23,12 +31,6 @@ from terrain.logs.run_topics import (
 )
 from terrain.logs.samples import checked_names, refuse_apart, short_name, whole_run_label
 from terrain.logs.tables import MAX_VALUES
-from terrain.logs.topics import (
-    Faults,
-    MappedTopics,
-    Topic,
-    standard_mapping,
-)
 from terrain.records import RunLog, Stream
 from terrain.robots import Robot, robot_named
 
@@ -40,7 +42,7 @@ def find_runs(place: Path, mapping: str | Path | None, robot: Robot | None) -> l
     ----------
     place : folder of bags, the folder of a bag or a file; one in a folder of its own is labelled with that
         folder's name as its terrain
-    mapping : YAML file (:mod:`terrain.logs.topics`); by the types of the topics by default
+    mapping : YAML file (:mod:`terrain.logs.mapping`); by the types of the topics by default
     robot : of all runs that do not name theirs; that of the mapping by default
     """
     if place.is_file():  # one that the user names may be a link

@@ -19,8 +19,8 @@ from terrain.errors import LogError, TerrainError
 
 if TYPE_CHECKING:
     from terrain.logs.duplicates import SharedStretch
-    from terrain.logs.labels import RecordedWindow
     from terrain.logs.plausibility import Doubt
+    from terrain.logs.run_folders import RecordedWindow
 
 EXAMPLE = "terrain convert logs/ --mapping mapping.yaml --out runs/"
 
@@ -125,8 +125,7 @@ def _recorded_windows(place: Path) -> dict[str, list[RecordedWindow]]:
     """Return the windows that lie beside the streams of run folders, or in recordings, by run."""
     from pipelines.data.bag_files import find_bags
     from pipelines.data.bag_runs import recorded_windows
-    from terrain.logs.labels import read_windows
-    from terrain.logs.run_folders import read_run_head, run_folders
+    from terrain.logs.run_folders import read_run_head, read_windows, run_folders
 
     folders = run_folders(place) if place.is_dir() else []
     found = {read_run_head(folder).run_id: read_windows(folder) or [] for folder in folders}

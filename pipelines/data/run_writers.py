@@ -17,10 +17,17 @@ from pipelines.data.bag_files import McapWriter, library
 from pipelines.data.settings import Target
 from terrain.files.atomic import atomic_file, atomic_folder
 from terrain.kinematics.standard_messages import StandardTopic, standard_topic
-from terrain.logs.labels import WINDOWS_FILE, RecordedWindow, windows_text
-from terrain.logs.run_folders import RunHead, run_folder, write_csv, write_run
+from terrain.logs.mapping import DISTRO
+from terrain.logs.run_folders import (
+    WINDOWS_FILE,
+    RecordedWindow,
+    RunHead,
+    run_folder,
+    windows_text,
+    write_csv,
+    write_run,
+)
 from terrain.logs.run_topics import Messages, origin_of, run_messages, stamps_ns
-from terrain.logs.topics import DISTRO
 from terrain.records import Array, RunLog
 
 

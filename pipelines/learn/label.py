@@ -21,7 +21,7 @@ from terrain.files.names import plain_name
 
 if TYPE_CHECKING:
     from terrain.classify.proposals import LabelSource, Proposal
-    from terrain.logs.labels import DoubtfulWindow, RunWindows
+    from terrain.logs.run_folders import DoubtfulWindow, RunWindows
     from terrain.records import Label, RunLog
 
 EXAMPLE = "terrain label runs/ --run GRASS_01 --from 2 --to 6 --terrain SNOW"
@@ -129,7 +129,7 @@ def run(
     settings: Settings, progress: Progress = silent
 ) -> DoubtfulResult | LabelResult | ProposalsResult | AnswersResult:
     """List doubtful windows, or change labels, or propose them, or take answers, as the settings have it."""
-    from terrain.logs.labels import doubtful_windows, set_label
+    from terrain.logs.run_folders import doubtful_windows, set_label
 
     if settings.model is not None:
         return _propose(settings, settings.model)

@@ -27,9 +27,8 @@ from pipelines.data.bag_files import McapWriter
 from pipelines.live.chain import CommandStatus, Step
 from pipelines.live.classifying import WindowOutput
 from terrain.control.switching import SWITCHING
-from terrain.logs.labels import RecordedWindow
 from terrain.logs.replay import TWIST
-from terrain.logs.run_folders import RunHead, run_folder
+from terrain.logs.run_folders import RecordedWindow, RunHead, run_folder
 from terrain.logs.run_topics import LATEST_S, WINDOW_TOPIC, RunRecorder, check_recordable
 from terrain.logs.samples import BAD_TIME
 from terrain.records import Array, Reading

@@ -19,7 +19,7 @@ from terrain.control.switching import UNKNOWN
 from terrain.errors import DataError
 from terrain.files.documents import accepted
 from terrain.files.names import read_regular
-from terrain.logs.labels import Number
+from terrain.logs.run_folders import Number
 
 #: A bias older than that is estimated anew: with temperature it moves further than its walk says.
 BIASES_FRESH_S = 600.0

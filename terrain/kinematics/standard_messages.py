@@ -13,10 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from terrain.kinematics.camera import CHANNELS, QUATERNION_TOLERANCE, to_body, to_camera
-from terrain.logs.mapping import POSITION_CHANNELS, local_metres
+from terrain.logs.mapping import POSITION_CHANNELS, Converted, MessageKind, local_metres
 from terrain.logs.replay import TWIST
 from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS
-from terrain.logs.topics import Converted, MessageKind
 from terrain.records import Array, Stream
 
 UNKNOWN = -1.0

@@ -22,11 +22,10 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 from terrain.errors import DataError, LogError
 from terrain.files.documents import accepted, parse_json
 from terrain.files.names import plain_name, shown
-from terrain.logs.labels import label_changes
-from terrain.logs.run_folders import MAX_STREAMS, MAY_BE_UNKNOWN, LabelEntry, RunHead
+from terrain.logs.mapping import DAMAGED_MESSAGE, Faults, Topic
+from terrain.logs.run_folders import MAX_STREAMS, MAY_BE_UNKNOWN, LabelEntry, RunHead, label_changes
 from terrain.logs.samples import DEAD_CHANNEL, checked_stream
 from terrain.logs.schema import unit_of
-from terrain.logs.topics import DAMAGED_MESSAGE, Faults, Topic
 from terrain.records import Array, Label, RunLog, Stream
 
 PREFIX = "/terrain/"

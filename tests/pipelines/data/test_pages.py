@@ -7,8 +7,7 @@ import cantools
 
 from pipelines.data.run_writers import messages_of_run
 from terrain.files.names import data_folder
-from terrain.logs.mapping import load_topics
-from terrain.logs.topics import TYPES, short_type
+from terrain.logs.mapping import TYPES, load_topics, short_type
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 ROW = re.compile(

@@ -14,8 +14,7 @@ from pipelines.data.convert import Settings
 from pipelines.data.convert import run as convert
 from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
-from terrain.logs.labels import WINDOWS_FILE, RecordedWindow, windows_text
-from terrain.logs.run_folders import data_digest, write_run
+from terrain.logs.run_folders import WINDOWS_FILE, RecordedWindow, data_digest, windows_text, write_run
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 

@@ -11,8 +11,7 @@ from pipelines.data.datasets import load_runs
 from pipelines.learn.label import SOURCES_FILE, Settings
 from pipelines.learn.label import run as label
 from terrain.errors import ConfigError, DataError, LogError
-from terrain.logs.labels import WINDOWS_FILE, RecordedWindow, windows_text
-from terrain.logs.run_folders import read_run, write_run
+from terrain.logs.run_folders import WINDOWS_FILE, RecordedWindow, read_run, windows_text, write_run
 
 WINDOWS = [
     RecordedWindow(

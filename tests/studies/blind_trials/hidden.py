@@ -31,7 +31,7 @@ from terrain.effects import (
     library_of,
 )
 from terrain.kinematics.logged_wheels import with_wheel_speeds
-from terrain.logs.held import CHANNELS as TWIST_CHANNELS
+from terrain.logs.drive import CHANNELS as TWIST_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 from terrain.simulation.plants.planar import Ground, spread_numbers

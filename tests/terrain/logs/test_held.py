@@ -3,8 +3,16 @@
 import numpy as np
 import pytest
 
-from terrain.logs.drive import DriveRobot, find_runs, read_window_poses
-from terrain.logs.held import N_FRAME, body_twists, frame_coefficient, is_first_pose, undo_hold
+from terrain.logs.drive import (
+    N_FRAME,
+    DriveRobot,
+    body_twists,
+    find_runs,
+    frame_coefficient,
+    is_first_pose,
+    read_window_poses,
+    undo_hold,
+)
 
 from .held_poses import PERIOD_S, N, published_pose
 

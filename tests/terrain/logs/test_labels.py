@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrain.logs.labels import relabelled
+from terrain.logs.run_folders import relabelled
 
 times = st.integers(0, 20).map(float)
 intervals = st.tuples(times, times).filter(lambda each: each[0] < each[1])

@@ -10,9 +10,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from terrain.errors import DataError, LogError, TerrainError
+from terrain.logs.mapping import Faults, Topic
 from terrain.logs.run_folders import data_digest, find_runs, read_run, write_run
 from terrain.logs.run_topics import RUN_TOPIC, read_document, run_messages, run_of, string_of
-from terrain.logs.topics import Faults, Topic
 from terrain.records import Label, RunLog, Stream
 
 

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from terrain.errors import ConfigError, LogError
 from terrain.kinematics.standard_messages import KINDS
-from terrain.logs.mapping import load_topics
-from terrain.logs.topics import Faults, MappedTopics, Topic
+from terrain.logs.mapping import Faults, MappedTopics, Topic, load_topics
 
 START_NS = 1_700_000_000_123_456_789
 TYPES = {
