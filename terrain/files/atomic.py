@@ -31,35 +31,29 @@ def file_lock(path: Path, timeout_s: float, purpose: str) -> Iterator[None]:
     file cannot be made.
     """
     until_s = time.monotonic() + timeout_s
-    descriptor = _opened(path, until_s)
+    descriptor = -1
     try:
         while True:
             try:
+                if descriptor < 0:
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
             except BlockingIOError:
                 if time.monotonic() >= until_s:
-                    raise TerrainError(
-                        f"{path}: another process {purpose} and has not ended within {timeout_s:g} s; try "
-                        "again when it has"
-                    ) from None
+                    ended = f"has not ended within {timeout_s:g} s; try again when it has"
+                    raise TerrainError(f"{path}: another process {purpose} and {ended}") from None
                 time.sleep(POLL_S)
+            except OSError as error:
+                # another process may remove an empty folder between its making and its use
+                passing = isinstance(error, FileNotFoundError | FileExistsError) and not path.parent.is_file()
+                if not passing or time.monotonic() >= until_s:
+                    raise _not_written(path, error) from error
         yield
     finally:
-        os.close(descriptor)  # frees the lock
-
-
-def _opened(path: Path, until_s: float) -> int:
-    """Open the file; another process may remove an empty folder between its making and its use."""
-    while True:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        except (FileNotFoundError, FileExistsError) as error:
-            if path.parent.is_file() or time.monotonic() >= until_s:
-                raise _not_written(path, error) from error
-        except OSError as error:
-            raise _not_written(path, error) from error
+        if descriptor >= 0:
+            os.close(descriptor)  # frees the lock
 
 
 def atomic_write(path: str | Path, content: bytes | str) -> None:

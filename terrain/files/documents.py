@@ -103,20 +103,39 @@ def parse_json(content: bytes | str) -> Any:
     Traceback (most recent call last):
     ValueError: holds NaN, finite numbers are required
     """
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict(pairs)
+        if len(found) < len(pairs):
+            names = [name for name, _ in pairs]
+            twice = next(name for name in names if names.count(name) > 1)
+            raise ValueError(f"is no JSON (key {shown(twice)} is given twice)")
+        return found
+
+    def refuse(name: str) -> Any:
+        raise ValueError(f"holds {name}, finite numbers are required")
+
+    def finite(digits: str) -> float:
+        return number if math.isfinite(number := float(digits)) else refuse(digits[:20])
+
+    def whole(digits: str) -> int:
+        if len(digits) > 20 or abs(int(digits)) >= _MAX_WHOLE:
+            raise ValueError("holds a whole number of more than 64 bits")
+        return int(digits)
+
     try:
         text = content if isinstance(content, str) else content.decode("utf-8-sig")
-        found = json.loads(
-            text,
-            object_pairs_hook=_object,
-            parse_constant=_refuse_constant,
-            parse_float=_finite,
-            parse_int=_whole,
-        )
+        hooks: dict[str, Any] = {"parse_constant": refuse, "parse_float": finite, "parse_int": whole}
+        found = json.loads(text, object_pairs_hook=unique, **hooks)
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"is no JSON ({error})") from error
     except RecursionError as error:
         raise ValueError(_DEEP) from error
-    if _is_deep(found):
+    level = [found] if isinstance(found, dict | list) else []
+    for _ in range(MAX_DEPTH):  # lists and mappings within those of the level above
+        every = [each.values() if isinstance(each, dict) else each for each in level]
+        level = [child for children in every for child in children if isinstance(child, dict | list)]
+    if level:
         raise ValueError(_DEEP)
     if "\\u" in text:
         try:
@@ -137,46 +156,6 @@ def parse_document(content: bytes | str, model: type[Document]) -> Document:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         raise ValueError(f"{place}: {first['msg']}") from None
-
-
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in found:
-            raise ValueError(f"is no JSON (key {shown(key)} is given twice)")
-        found[key] = value
-    return found
-
-
-def _refuse_constant(name: str) -> Any:
-    raise ValueError(f"holds {name}, finite numbers are required")
-
-
-def _finite(digits: str) -> float:
-    if not math.isfinite(number := float(digits)):
-        _refuse_constant(digits[:20])
-    return number
-
-
-def _whole(digits: str) -> int:
-    if len(digits) > 20 or abs(int(digits)) >= _MAX_WHOLE:
-        raise ValueError("holds a whole number of more than 64 bits")
-    return int(digits)
-
-
-def _is_deep(found: Any) -> bool:
-    level = [found]
-    for _ in range(MAX_DEPTH):
-        level = [
-            child
-            for parent in level
-            if isinstance(parent, dict | list)
-            for child in (parent.values() if isinstance(parent, dict) else parent)
-            if isinstance(child, dict | list)
-        ]
-        if not level:
-            return False
-    return True
 
 
 def accepted(

@@ -102,12 +102,10 @@ from terrain.errors import LogError
 from terrain.files.names import normal_name
 from terrain.logs.imu_axes import MIN_MOVING_RADPS, POWER_SIGN, current_sign, find_axes, with_sign_of_torque
 from terrain.logs.samples import (
-    BAD_TIME,
     check_log_file,
     checked_names,
     checked_stream,
-    longest_rise,
-    refuse_or_count,
+    rising_rows,
     short_name,
 )
 from terrain.logs.schema import POSE_CHANNELS
@@ -494,15 +492,8 @@ class _Recording:
             raise LogError(f"{self.name}: has {len(table)} rows of data, at least 2 are needed")
         if len(state) != len(table):  # rows of another length, which both readers leave out alike
             raise LogError(f"{self.name}: its rows do not have one state each")
-        time_s, finite = table[:, 0], np.flatnonzero(np.isfinite(table[:, 0]))
-        fallen = np.flatnonzero(~(np.diff(time_s) > 0.0))
-        if fallen.size or finite.size < len(table):
-            row = int(fallen[0]) + 1 if fallen.size else int(np.flatnonzero(~np.isfinite(time_s))[0])
-            at = f"{row_number(path, row)} ({time_s[row]:.15g} s after {time_s[row - 1]:.15g} s)"
-            kept = finite[longest_rise(time_s[finite])]
-            fault = f"{self.name}: time does not rise at row {at}: a clock that restarts?"
-            refuse_or_count(repairs, BAD_TIME, fault, len(table) - len(kept))
-            table, state = table[kept], state[kept]
+        kept = rising_rows(self.name, table[:, 0], partial(row_number, path), repairs)
+        table, state = table[kept], state[kept]
         column = dict(zip(columns, table.T, strict=True))
         self.time_s, step = column["time"], column["calib_step"]
         for row in np.flatnonzero(~((step >= 0) & (step == np.floor(step)))).tolist():

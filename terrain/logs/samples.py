@@ -152,6 +152,28 @@ def longest_rise(time_s: Array) -> Array:
     return np.array(chain[::-1], dtype=np.intp)
 
 
+def rising_rows(
+    name: str, time_s: Array, row_of: Callable[[int], int], repairs: Counter[str] | None
+) -> Array | slice:
+    """Return which rows have times that are finite and rise; refuse others, or count them (:func:`checked_stream`)."""
+    finite = np.flatnonzero(np.isfinite(time_s))
+    fallen = 1 + np.flatnonzero(np.diff(time_s[finite]) <= 0.0)
+    if finite.size == time_s.size and not fallen.size:
+        return slice(None)
+    if repairs is not None:
+        kept = finite[longest_rise(time_s[finite])]
+        repairs[BAD_TIME] += time_s.size - kept.size
+        return kept
+    if finite.size < time_s.size:
+        row = int(np.flatnonzero(~np.isfinite(time_s))[0])
+        raise LogError(f"{name}: time at row {row_of(row)} is not finite ({time_s[row]})")
+    row = int(fallen[0])
+    now, then = float(time_s[row]), float(time_s[row - 1])
+    if now == then:
+        raise LogError(f"{name}: time repeats at row {row_of(row)} ({now:.15g} s twice)")
+    raise LogError(f"{name}: time goes back at row {row_of(row)} ({now:.15g} s after {then:.15g} s)")
+
+
 def checked_stream(
     name: str,
     time_s: Array,
@@ -183,21 +205,8 @@ def checked_stream(
     terrain.errors.LogError: a.csv: time goes back at row 4 (0.1 s after 0.2 s)
     """
     values = np.where(np.isfinite(values), values, np.nan)
-    finite = np.flatnonzero(np.isfinite(time_s))
-    fallen = 1 + np.flatnonzero(np.diff(time_s[finite]) <= 0.0)
-    if finite.size < time_s.size or fallen.size:
-        if repairs is None and finite.size < time_s.size:
-            row = int(np.flatnonzero(~np.isfinite(time_s))[0])
-            raise LogError(f"{name}: time at row {row_of(row)} is not finite ({time_s[row]})")
-        if repairs is None:
-            row = int(fallen[0])
-            now, then = float(time_s[row]), float(time_s[row - 1])
-            if now == then:
-                raise LogError(f"{name}: time repeats at row {row_of(row)} ({now:.15g} s twice)")
-            raise LogError(f"{name}: time goes back at row {row_of(row)} ({now:.15g} s after {then:.15g} s)")
-        kept = finite[longest_rise(time_s[finite])]
-        repairs[BAD_TIME] += time_s.size - kept.size
-        time_s, values = time_s[kept], values[kept]
+    kept = rising_rows(name, time_s, row_of, repairs)
+    time_s, values = time_s[kept], values[kept]
     if time_s.size < 2:
         raise LogError(f"{name}: has {time_s.size} usable rows of data, at least 2 are needed")
     implausible = np.abs(values) > MAX_MAGNITUDE

@@ -241,7 +241,7 @@ FAULTS = [
     ("drive-recording", without("calib_state"), "column 'calib_state' is missing", None),
     ("drive-recording", cell("imu_z", 7, "north"), "imu_z at row 9 is 'north', which is no number", BAD_CELL),
     ("drive-recording", cell("calib_step", 7, 1.5), "calib_step at row 9 is 1.5; it must be a whole", None),
-    ("drive-recording", restart("time", 300), "time does not rise at row 302", BAD_TIME),
+    ("drive-recording", restart("time", 300), "time goes back at row 302", BAD_TIME),
     (
         "robotino",
         cell("m2cur", 5, "high"),
