@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.data.datasets import load_runs
 from terrain.errors import DataError
-from terrain.logs.duplicates import groups_of, merge_runs, possible_pairs, run_print, shared_stretches
+from terrain.logs.duplicates import merge_runs, possible_pairs, run_print, shared_stretches
 from terrain.records import Label, RunLog, Stream
 
 
@@ -110,19 +110,6 @@ def test_a_piece_is_found_where_it_was_cut(runs, length_s):
         assert found.first == runs[3].run_id
         assert found.first_start_s - found.second_start_s == pytest.approx(start_s, abs=0.05)
         assert found.duration_s == pytest.approx(length_s, abs=1.5)
-
-
-def test_an_overlap_of_two_pieces_is_found_and_no_more(runs):
-    early, late = cut(runs[0], 0.0, 14.0, "early"), cut(runs[0], 6.0, 24.0, "late")
-    (found,) = shared_stretches([early, late, *runs[1:]])
-    assert (found.first_start_s, found.first_end_s) == pytest.approx((6.0, 14.0), abs=0.8)
-    assert (found.second_start_s, found.second_end_s) == pytest.approx((0.0, 8.0), abs=0.8)
-
-
-def test_all_of_many_copies_are_in_one_group(runs):
-    copies = [changed(runs[2], CHANGES["clock offset"], f"copy {i}") for i in range(20)]
-    (group,) = groups_of(shared_stretches([*runs, *copies]))
-    assert set(group) == {runs[2].run_id, *(each.run_id for each in copies)}
 
 
 def test_runs_that_stand_or_repeat_themselves_are_no_copies():

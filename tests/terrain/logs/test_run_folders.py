@@ -160,20 +160,6 @@ def test_a_wrong_run_json_is_refused_in_one_sentence(tmp_path, make_run, change,
     assert len(str(error.value)) < 500
 
 
-def test_damaged_files_are_refused_in_one_sentence(tmp_path, make_run):
-    folder = write_run(make_run(), tmp_path)
-    whole = (folder / "imu.parquet").read_bytes()
-    for content in (b"", whole[: len(whole) // 2], b"time_s,gyro\n"):
-        (folder / "imu.parquet").write_bytes(content)
-        with pytest.raises(LogError, match=r"^SNOW_01/imu\.parquet: is no whole Parquet file .*$"):
-            read_run(folder)
-    (folder / "run.json").write_text('{"run_id": ')
-    with pytest.raises(LogError, match=r"SNOW_01/run\.json: is no JSON"):
-        read_run(folder)
-    with pytest.raises(LogError, match=r"nowhere/run\.json: is missing"):
-        read_run(tmp_path / "nowhere")
-
-
 def test_the_digest_sees_content_and_nothing_else(make_run):
     run, other = make_run(), make_run("SNOW_02", seed=1)
     imu = run.streams["imu"]
