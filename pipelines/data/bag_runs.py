@@ -12,11 +12,11 @@ from terrain.errors import ConfigError, LogError
 from terrain.kinematics.standard_messages import KINDS
 from terrain.logs.mapping import (
     Faults,
-    MappedTopics,
     MessageStream,
     Topic,
     TopicMapping,
     load_topics,
+    mapped_streams,
     standard_mapping,
 )
 from terrain.logs.run_folders import RecordedWindow, window_of_text
@@ -31,7 +31,7 @@ from terrain.logs.run_topics import (
 )
 from terrain.logs.samples import checked_names, refuse_apart, short_name, whole_run_label
 from terrain.logs.tables import MAX_VALUES
-from terrain.records import RunLog, Stream
+from terrain.records import Label, RunLog, Stream
 from terrain.robots import Robot, robot_named
 
 
@@ -84,13 +84,10 @@ def read_run(
     if not name:
         raise ConfigError(f"{place}: a bag does not name its robot: give it by --robot or in the mapping")
     faults = Faults(Counter() if repair else None)
-    found = _mapped(bag, mapping, topics, wheel_radius_m(name, robot), faults)
-    start_ns, streams = found.streams()
+    streams, intervals = _mapped(bag, mapping, topics, wheel_radius_m(name, robot), faults)
     parts = _parts(path, folder)
     refuse_apart("_".join(parts), streams)
-    if mapping.labels:
-        intervals = found.labels(start_ns, streams)
-    else:
+    if not mapping.labels:
         terrain = mapping.terrain or (parts[0] if len(parts) > 1 else "")
         intervals = (whole_run_label(streams, terrain),) if terrain else ()
     run = RunLog(
@@ -118,20 +115,22 @@ def read_stream(
     """
     mapping = TopicMapping(streams={name: stream})
     bag = open_bag(path)
-    found = _mapped(bag, mapping, topics_of(bag), radius_m, Faults(repairs))
-    return found.streams(start_ns=0)[1][name]
+    return _mapped(bag, mapping, topics_of(bag), radius_m, Faults(repairs), 0)[0][name]
 
 
 def _mapped(
-    bag: Bag, mapping: TopicMapping, topics: Mapping[str, Topic], radius_m: float | None, faults: Faults
-) -> MappedTopics:
-    """Return the topics of a mapping, with the messages of a bag."""
+    bag: Bag,
+    mapping: TopicMapping,
+    topics: Mapping[str, Topic],
+    radius_m: float | None,
+    faults: Faults,
+    start_ns: int | None = None,
+) -> tuple[dict[str, Stream], tuple[Label, ...]]:
+    """Return the streams and labels of a bag by a mapping."""
     place = short_name(bag.path)
     decoder = partial(decoder_of, place, distro=bag.distro)
-    found = MappedTopics(place, mapping, topics, KINDS, decoder, radius_m, faults)
-    for message in messages_of(bag, found.names, faults):
-        found.take(*message)
-    return found
+    messages = partial(messages_of, bag, faults=faults)
+    return mapped_streams(place, mapping, topics, KINDS, decoder, messages, radius_m, faults, start_ns)
 
 
 def _exported_run(bag: Bag, place: str, topics: Mapping[str, Topic], *, repair: bool) -> RunLog:

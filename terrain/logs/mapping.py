@@ -22,7 +22,7 @@ from __future__ import annotations
 import glob
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -676,134 +676,134 @@ class _Source(NamedTuple):
     channels: Callable[[Array], Converted]
 
 
-class MappedTopics:
-    """The topics of a mapping: takes their messages, each once, and gives the streams that they become.
+def mapped_streams(
+    place: str,
+    mapping: TopicMapping,
+    topics: Mapping[str, Topic],
+    kinds: Mapping[str, MessageKind],
+    decoder: Callable[[Topic], Callable[[bytes], Any]],
+    messages: Callable[[frozenset[str]], Iterable[tuple[str, int, bytes]]],
+    wheel_radius_m: float | None,
+    faults: Faults,
+    start_ns: int | None = None,
+) -> tuple[dict[str, Stream], tuple[Label, ...]]:
+    """Return the streams that the messages of topics become by a mapping, and the intervals of its topic of labels.
 
-    ``topics`` are those that there are, by name; ``kinds`` by type of message those that become channels of their own;
-    ``decoder`` returns what makes an object of each message of a topic.  ``LogError`` where there is no such topic, or
-    one of another type; ``ConfigError`` where speeds of wheels need the radius and none is known.
+    Their time begins at the first stamp unless another is given; when repairing at the first of those in order.
+
+    Parameters
+    ----------
+    place : what messages call the log
+    mapping : of its topics
+    topics : that there are, by name
+    kinds : by type of message those that become channels of their own
+    decoder : returns what makes an object of each message of a topic
+    messages : yields topic, log time in ns and content of each message of some topics
+    wheel_radius_m : of the robot; None where unknown
+    faults : of the log
+    start_ns : stamp at which time begins
+
+    Raises
+    ------
+    LogError
+        if there is no such topic, or one of another type; where a topic has no message, topics of a stream have no
+        stamp in common, stamps go back or repeat, a channel has nothing finite, or there are fewer than two samples.
+    ConfigError
+        if speeds of wheels need the radius and none is known.
     """
+    sources: dict[str, _Source] = {}
+    there, repairs, labels = _described([*topics.values()]), faults.repairs, mapping.labels
+    for name, stream in mapping.streams.items():
+        at = f"{place}: stream {name}"
+        for topic in (stream.topic, *(channel.topic for channel in stream.channels.values())):
+            if topic and topic not in topics:
+                raise LogError(f"{at}: there is no topic {shown(topic)} (there are {there})")
+        kind = topics[stream.topic].kind
+        if stream.kind != "fields" and short_type(kind) not in TYPES[stream.kind]:
+            required = f"kind {stream.kind!r} is {' or '.join(TYPES[stream.kind])} (there are {there})"
+            raise LogError(f"{at}: topic {stream.topic} is of type {kind}, {required}")
+        if stream.channels:
+            sources[name] = _fields_source(at, stream, wheel_radius_m)
+        else:
+            of_kind = kinds[short_type(kind)]
+            paths = {stream.topic: [(path, "") for path in of_kind.paths]}
+            sources[name] = _Source(stream, paths, of_kind.channels)
+    if labels and labels not in topics:
+        raise LogError(f"{place}: labels: there is no topic {shown(labels)} (there are {there})")
+    if labels and short_type(topics[labels].kind) != LABELS_TYPE:
+        of_type = f"topic {labels} is of type {topics[labels].kind}"
+        raise LogError(f"{place}: labels: {of_type}, {LABELS_TYPE} is required")
+    asked = [each for source in sources.values() for each in source.paths.items()]
+    of_topic: dict[str, _TopicNumbers] = {}
+    for topic, numbers in [*asked, *([(labels, [])] if labels else [])]:
+        if topic not in of_topic:
+            of_topic[topic] = _TopicNumbers(place, topics[topic], decoder(topics[topic]), faults)
+        for path in numbers:
+            of_topic[topic].paths.setdefault(path, len(of_topic[topic].paths))
+    for topic, log_ns, content in messages(frozenset(of_topic)):
+        of_topic[topic].take(log_ns, content)
+    raw = {}
+    for name, source in sources.items():
+        by_header = (source.stream.time or mapping.time) == "header"
+        raw[name] = _joined(place, name, source, of_topic, by_header, faults)
+    if start_ns is None:
+        stamps = [stamp_ns for stamp_ns, *_ in raw.values()]
+        firsts = [each.min() if repairs is None else each[longest_rise(each)[0]] for each in stamps]
+        start_ns = min(map(int, firsts))
+    streams = {}
+    for name, (stamp_ns, channels, values) in raw.items():
+        at = f"{place}: stream {name}"
+        if stamp_ns.size > 1 and not np.any(stamp_ns):
+            raise LogError(f"{at}: all headers are stamped 0; take the log times (time: log)")
+        streams[name] = checked_stream(at, (stamp_ns - start_ns) / 1e9, values, channels, repairs=repairs)
+    texts = sorted(of_topic[labels].texts, key=lambda each: each[0]) if labels else []
+    return streams, label_intervals(texts, start_ns, streams)
 
-    def __init__(
-        self,
-        place: str,
-        mapping: TopicMapping,
-        topics: Mapping[str, Topic],
-        kinds: Mapping[str, MessageKind],
-        decoder: Callable[[Topic], Callable[[bytes], Any]],
-        wheel_radius_m: float | None,
-        faults: Faults,
-    ) -> None:
-        self._place, self._mapping, self._faults = place, mapping, faults
-        self._sources: dict[str, _Source] = {}
-        self._of_topic: dict[str, _TopicNumbers] = {}
-        there = _described([*topics.values()])
-        for name, stream in mapping.streams.items():
-            at = f"{place}: stream {name}"
-            for topic in (stream.topic, *(channel.topic for channel in stream.channels.values())):
-                if topic and topic not in topics:
-                    raise LogError(f"{at}: there is no topic {shown(topic)} (there are {there})")
-            kind = topics[stream.topic].kind
-            if stream.kind != "fields" and short_type(kind) not in TYPES[stream.kind]:
-                required = f"kind {stream.kind!r} is {' or '.join(TYPES[stream.kind])} (there are {there})"
-                raise LogError(f"{at}: topic {stream.topic} is of type {kind}, {required}")
-            radius, radius_m = stream.wheel_radius, wheel_radius_m
-            if radius is not None:
-                radius_m = radius.value * UNIT_SCALES[radius.unit][1]
-            if stream.channels:
-                self._sources[name] = _fields_source(at, stream, radius_m)
-            else:
-                of_kind = kinds[short_type(kind)]
-                paths = {stream.topic: [(path, "") for path in of_kind.paths]}
-                self._sources[name] = _Source(stream, paths, of_kind.channels)
-        labels = mapping.labels
-        if labels and labels not in topics:
-            raise LogError(f"{place}: labels: there is no topic {shown(labels)} (there are {there})")
-        if labels and short_type(topics[labels].kind) != LABELS_TYPE:
-            of_type = f"topic {labels} is of type {topics[labels].kind}"
-            raise LogError(f"{place}: labels: {of_type}, {LABELS_TYPE} is required")
-        asked = [each for source in self._sources.values() for each in source.paths.items()]
-        for name, numbers in [*asked, *([(labels, [])] if labels else [])]:
-            if name not in self._of_topic:
-                self._of_topic[name] = _TopicNumbers(place, topics[name], decoder(topics[name]), faults)
-            for path in numbers:
-                self._of_topic[name].paths.setdefault(path, len(self._of_topic[name].paths))
 
-    @property
-    def names(self) -> frozenset[str]:
-        """Topics whose messages are taken."""
-        return frozenset(self._of_topic)
-
-    def take(self, topic: str, log_ns: int, content: bytes) -> None:
-        """Take a message of one of :attr:`names`, with its log time in ns."""
-        self._of_topic[topic].take(log_ns, content)
-
-    def streams(self, start_ns: int | None = None) -> tuple[int, dict[str, Stream]]:
-        """Return the stamp in ns at which the time of the streams begins, and the streams.
-
-        That stamp is the first one unless it is given; when repairing the first of those in order.  ``LogError``
-        where a topic has no message, topics of a stream have no stamp in common, stamps go back or repeat, a
-        channel has nothing finite, or there are fewer than two samples.
-        """
-        raw = {name: self._raw(name, source) for name, source in self._sources.items()}
-        repairs = self._faults.repairs
-        if start_ns is None:
-            stamps = [stamp_ns for stamp_ns, *_ in raw.values()]
-            firsts = [each.min() if repairs is None else each[longest_rise(each)[0]] for each in stamps]
-            start_ns = min(map(int, firsts))
-        streams = {}
-        for name, (stamp_ns, channels, values) in raw.items():
-            at = f"{self._place}: stream {name}"
-            if stamp_ns.size > 1 and not np.any(stamp_ns):
-                raise LogError(f"{at}: all headers are stamped 0; take the log times (time: log)")
-            time_s = (stamp_ns - start_ns) / 1e9
-            streams[name] = checked_stream(at, time_s, values, channels, repairs=repairs)
-        return start_ns, streams
-
-    def labels(self, start_ns: int, streams: Mapping[str, Stream]) -> tuple[Label, ...]:
-        """Return the terrain intervals of the topic of labels."""
-        texts = self._of_topic[self._mapping.labels].texts
-        return label_intervals(sorted(texts, key=lambda each: each[0]), start_ns, streams)
-
-    def _raw(self, name: str, source: _Source) -> tuple[Array, tuple[str, ...], Array]:
-        """Return the stamps (n,) in ns, the channels and the values (n, c) of a stream."""
-        stream = source.stream
-        by_header = (stream.time or self._mapping.time) == "header"
-        stamps, values = list[Array](), list[Array]()
-        for topic, paths in source.paths.items():
-            stamp_ns, numbers = self._of_topic[topic].numbers(paths, by_header=by_header)
-            if not stamp_ns.size:
-                what = " with any of the joints" if stream.kind == "joints" else ""
-                raise LogError(f"{self._place}: topic {shown(topic)} has no message{what}")
-            order = np.argsort(stamp_ns, kind="stable") if len(source.paths) > 1 else slice(None)
-            stamps.append(stamp_ns[order])
-            values.append(numbers[order])
-        common = stamps[0]
-        if len(stamps) > 1 and stream.join == "previous":
-            for i, each in enumerate(stamps[1:], start=1):
-                row = np.searchsorted(each, common, side="right") - 1
-                values[i] = np.where((row >= 0)[:, None], values[i][np.maximum(row, 0)], np.nan)
-        elif len(stamps) > 1:
-            for each in stamps[1:]:
-                common = np.intersect1d(common, each)
-            n_lost = sum(each.size for each in stamps) - common.size * len(stamps)
-            if n_lost:
-                topics = " and ".join(shown(topic) for topic in source.paths)
-                text = f"{name}: {n_lost} messages of {topics} lack one of equal stamp (join: previous)"
-                self._faults.found(self._place, UNMATCHED, text, n_lost)
-            if not common.size:
-                fault = "no two stamps of its topics agree (join: previous)"
-                raise LogError(f"{self._place}: stream {name}: {fault}")
-            rows = [np.searchsorted(each, common) for each in stamps]
-            values = [value[row] for value, row in zip(values, rows, strict=True)]
-        channels, joined = source.channels(np.concatenate(values, axis=1))
-        if not channels:
-            raise LogError(f"{self._place}: topic {shown(stream.topic)} states that it measures nothing")
-        return common, channels, joined
+def _joined(
+    place: str,
+    name: str,
+    source: _Source,
+    of_topic: Mapping[str, _TopicNumbers],
+    by_header: bool,
+    faults: Faults,
+) -> tuple[Array, tuple[str, ...], Array]:
+    """Return the stamps (n,) in ns, the channels and the values (n, c) of a stream, joined of its topics."""
+    stream = source.stream
+    stamps, values = list[Array](), list[Array]()
+    for topic, paths in source.paths.items():
+        stamp_ns, numbers = of_topic[topic].numbers(paths, by_header=by_header)
+        if not stamp_ns.size:
+            what = " with any of the joints" if stream.kind == "joints" else ""
+            raise LogError(f"{place}: topic {shown(topic)} has no message{what}")
+        order = np.argsort(stamp_ns, kind="stable") if len(source.paths) > 1 else slice(None)
+        stamps.append(stamp_ns[order])
+        values.append(numbers[order])
+    common = stamps[0]
+    if len(stamps) > 1 and stream.join == "previous":
+        for i, each in enumerate(stamps[1:], start=1):
+            row = np.searchsorted(each, common, side="right") - 1
+            values[i] = np.where((row >= 0)[:, None], values[i][np.maximum(row, 0)], np.nan)
+    elif len(stamps) > 1:
+        for each in stamps[1:]:
+            common = np.intersect1d(common, each)
+        if n_lost := sum(each.size for each in stamps) - common.size * len(stamps):
+            lost = f"{n_lost} messages of {' and '.join(shown(topic) for topic in source.paths)}"
+            text = f"{name}: {lost} lack one of equal stamp (join: previous)"
+            faults.found(place, UNMATCHED, text, n_lost)
+        if not common.size:
+            raise LogError(f"{place}: stream {name}: no two stamps of its topics agree (join: previous)")
+        values = [value[np.searchsorted(each, common)] for value, each in zip(values, stamps, strict=True)]
+    channels, joined = source.channels(np.concatenate(values, axis=1))
+    if not channels:
+        raise LogError(f"{place}: topic {shown(stream.topic)} states that it measures nothing")
+    return common, channels, joined
 
 
 def _fields_source(at: str, stream: MessageStream, wheel_radius_m: float | None) -> _Source:
     """Return where the channels of a stream of fields or joints are."""
+    if stream.wheel_radius is not None:
+        wheel_radius_m = stream.wheel_radius.value * UNIT_SCALES[stream.wheel_radius.unit][1]
     by_topic: dict[str, list[str]] = {stream.topic: []}
     for name, channel in stream.channels.items():
         by_topic.setdefault(channel.topic or stream.topic, []).append(name)

@@ -12,26 +12,6 @@ from terrain.errors import ConfigError, LogError
 TIME_TOLERANCE_S = 1e-6
 """Stamps are compared to this; it covers the rounding of decimal stamps, far below any sample period."""
 
-UNIT_SYMBOLS: dict[str, str] = {
-    "s": "s",
-    "m": "m",
-    "m2": "m^2",
-    "mps": "m/s",
-    "mps2": "m/s^2",
-    "rad": "rad",
-    "radps": "rad/s",
-    "a": "A",
-    "v": "V",
-    "nm": "Nm",
-    "n": "N",
-    "npr": "N/rad",
-    "ratio": "1",
-    "code": "-",
-    "k": "K",
-    "kg": "kg",
-}
-"""Unit word at the end of a channel name, and how it is printed; ``code`` is the number of a status."""
-
 _SCALES: dict[str, dict[str, float]] = {
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3},
@@ -47,6 +27,10 @@ _SCALES: dict[str, dict[str, float]] = {
     "k": {"K": 1.0, "degC": 1.0, "degF": 5.0 / 9.0},
     "kg": {"kg": 1.0, "t": 1e3},
 }
+UNIT_SYMBOLS: dict[str, str] = {word: next(iter(units)) for word, units in _SCALES.items()}
+UNIT_SYMBOLS |= {"m2": "m^2", "npr": "N/rad", "code": "-"}
+"""Unit word at the end of a channel name, and how it is printed; ``code`` is the number of a status."""
+
 UNIT_SCALES: dict[str, tuple[str, float]] = {
     unit: (word, factor) for word, units in _SCALES.items() for unit, factor in units.items()
 }

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from terrain.errors import ConfigError, LogError
 from terrain.kinematics.standard_messages import KINDS
-from terrain.logs.mapping import Faults, MappedTopics, Topic, load_topics
+from terrain.logs.mapping import Faults, Topic, load_topics, mapped_streams
 
 START_NS = 1_700_000_000_123_456_789
 TYPES = {
@@ -50,27 +50,23 @@ def twist_rows(topic, numbers, late_ns=lambda _: 0):
 
 
 @pytest.fixture
-def taken(tmp_path):
-    """Return what takes messages ``(topic, log time in ns, message)`` by the lines of a mapping."""
+def mapped(tmp_path):
+    """Return what makes streams and labels of messages ``(topic, log time in ns, message)`` by a mapping's lines."""
 
-    def take(lines, rows, repairs=None, wheel_radius_m=0.2):
+    def apply(lines, rows, repairs=None, wheel_radius_m=0.2):
         (tmp_path / "mapping.yaml").write_text(lines)
         types = {name: TYPES.get(name, "geometry_msgs/msg/Twist") for name, *_ in rows}
         topics = {name: Topic(name, kind, "json", "", "") for name, kind in types.items()}
-        mapping = load_topics(tmp_path / "mapping.yaml")
-        about = (KINDS, lambda _: lambda message: message, wheel_radius_m, Faults(repairs))
-        found = MappedTopics("a.mcap", mapping, topics, *about)
-        for row in rows:
-            if row[0] in found.names:
-                found.take(*row)
-        return found
+        about = load_topics(tmp_path / "mapping.yaml"), topics, KINDS, lambda _: lambda message: message
+        found = (lambda names: [row for row in rows if row[0] in names]), wheel_radius_m, Faults(repairs)
+        return mapped_streams("a.mcap", *about, *found)
 
-    return take
+    return apply
 
 
 @pytest.fixture
-def streams(taken):
-    return lambda *given, **options: taken(*given, **options).streams()[1]
+def streams(mapped):
+    return lambda *given, **options: mapped(*given, **options)[0]
 
 
 def test_the_attitude_is_that_of_the_quaternion_and_an_unknown_one_is_no_channel_or_nan(streams):
@@ -173,12 +169,11 @@ def test_topics_are_joined_by_equal_stamps_or_by_the_value_before(streams):
     np.testing.assert_array_equal(right_mps, [np.nan, 1, 2, 3, 3, 5])
 
 
-def test_terrains_of_a_topic_are_labels(taken):
+def test_terrains_of_a_topic_are_labels(mapped):
     changes = [(2.5, "ICE"), (3.0, "ICE"), (5.0, "SNOW"), (7.0, ""), (8.0, "ICE")]
     names = [("/terrain_name", START_NS + int(t * 1e9), SimpleNamespace(data=name)) for t, name in changes]
     rows = imu_rows([START_NS + 10**9 * i for i in range(11)]) + names
-    found = taken("labels: /terrain_name\n" + IMU, rows)
-    labels = found.labels(*found.streams())
+    _, labels = mapped("labels: /terrain_name\n" + IMU, rows)
     assert [*map(tuple, labels)] == [(2.5, 5.0, "ICE"), (5.0, 7.0, "SNOW"), (8.0, 11.0, "ICE")]
 
 
