@@ -116,7 +116,7 @@ def parse_json(content: bytes | str) -> Any:
         raise ValueError(f"holds {name}, finite numbers are required")
 
     def finite(digits: str) -> float:
-        return number if math.isfinite(number := float(digits)) else refuse(digits[:20])
+        return value if math.isfinite(value := float(digits)) else float(refuse(digits[:20]))
 
     def whole(digits: str) -> int:
         if len(digits) > 20 or abs(int(digits)) >= _MAX_WHOLE:

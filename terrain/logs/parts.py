@@ -80,12 +80,11 @@ class Assembler:
             self._dropped[f"{self._stream}: repeated or late"] += 1
             return
         known = part.counter is not None and self._counter is not None
-        if self._row and known and part.counter != self._counter:
-            self.finish()
-        elif not self._row.keys().isdisjoint(part.values):
-            if known:
-                self._dropped[f"{self._stream}: repeated or late"] += 1
-                return
+        again = not self._row.keys().isdisjoint(part.values)
+        if again and known and part.counter == self._counter:
+            self._dropped[f"{self._stream}: repeated or late"] += 1
+            return
+        if again or (known and part.counter != self._counter):
             self.finish()
         if not self._row:
             self._time_s = time_s
