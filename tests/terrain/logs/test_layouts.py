@@ -258,7 +258,7 @@ def test_a_fault_is_one_sentence_and_counted_or_skipped_by_a_repair(
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (lambda whole: b"", "is empty"),
+        (lambda whole: b"", "has no names of columns in row 3"),
         (lambda whole: whole[: len(whole) // 2], "is no whole gzip file"),
         (lambda whole: whole[:1000] + bytes(200) + whole[1200:], "is no whole gzip file"),
         (lambda whole: b"step,window\n1,2\n", "is no whole gzip file"),
