@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -130,11 +130,13 @@ def _heads(
     """Return the head of each run, and the pairs of ids that may hold the same measurements."""
     heads: list[RunHead] = []
     each = [(load,) for load in loaders]
-    prints = []
-    for head, codes, time_s in parallel(_head, (place,), each, n_jobs, "channels", progress):
-        heads.append(head)
-        prints.append(RunPrint(codes, time_s, bytes.fromhex(head.print_digest)))
-    pairs = [(heads[a].run_id, heads[b].run_id) for a, b in possible_pairs(prints)]
+
+    def prints() -> Iterator[RunPrint]:
+        for head, codes, time_s in parallel(_head, (place,), each, n_jobs, "channels", progress):
+            heads.append(head)
+            yield RunPrint(codes, time_s, bytes.fromhex(head.print_digest))
+
+    pairs = [(heads[a].run_id, heads[b].run_id) for a, b in possible_pairs(prints())]
     found = Counter(head.run_id for head in heads if not head.fault)
     if not found:
         raise LogError(f"not one run could be read, the first for this: {heads[0].fault}")

@@ -19,7 +19,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
+from tempfile import TemporaryFile
 from typing import NamedTuple
 
 import numpy as np
@@ -60,6 +62,12 @@ OFFSET_TOLERANCE_S = 0.3
 MAX_HOLE_S = 15.0
 #: An overlap that reaches so close to the end of a run reaches its end: the first peaks come later.
 EDGE_S = 1.5
+N_FILES = 32
+#: 2^64 over the golden ratio: the first bits of a product with it are spread evenly (Knuth, The Art of Computer
+#: Programming 3, section 6.4).
+SPREADING = np.uint64(0x9E3779B97F4A7C15)
+#: A fingerprint, the time of its first peak, and the run.
+PRINT = np.dtype([("code", "<i8"), ("time_s", "<f8"), ("run", "<i4")])
 #: A peak of a channel of a run; ``spread`` is that of the channel.
 PEAK = np.dtype([("run", int), ("time_s", float), ("height", float), ("spread", float), ("period_s", float)])
 
@@ -157,10 +165,11 @@ def run_print(run: RunLog) -> RunPrint:
     return RunPrint(codes[varies], peaks["time_s"][start[varies]], _digest(run))
 
 
-def possible_pairs(prints: Sequence[RunPrint]) -> list[tuple[int, int]]:
+def possible_pairs(prints: Iterable[RunPrint]) -> list[tuple[int, int]]:
     """Return the pairs of runs, by their places, that may share a stretch; :func:`shared_stretches` decides.
 
-    They have enough equal fingerprints near one offset of their clocks, or equal digests.
+    They have enough equal fingerprints near one offset of their clocks, or equal digests.  Fingerprints wait in files by
+    their value, of which one is read at a time: memory does not grow with the runs.
 
     Examples
     --------
@@ -168,19 +177,30 @@ def possible_pairs(prints: Sequence[RunPrint]) -> list[tuple[int, int]]:
     >>> possible_pairs([RunPrint(codes, time_s, b""), RunPrint(codes[1:], 50.0 + time_s[1:], b"")])
     [(0, 1)]
     """
-    if not prints:
-        return []
-    codes, time_s = (np.concatenate([each[i] for each in prints]) for i in (0, 1))
-    run = np.repeat(np.arange(len(prints)), [len(each.codes) for each in prints])
-    one, other = _equal(codes, run)
-    order = np.lexsort((time_s[other] - time_s[one], run[other], run[one]))
-    one, other = one[order], other[order]
-    first, second, offset_s = run[one], run[other], time_s[other] - time_s[one]
+    digests: list[bytes] = []
+    found = []
+    with ExitStack() as stack:
+        files = [stack.enter_context(TemporaryFile()) for _ in range(N_FILES)]
+        for run, each in enumerate(prints):
+            records = np.empty(len(each.codes), PRINT)
+            records["code"], records["time_s"], records["run"] = each.codes, each.time_s, run
+            digests.append(each.digest)
+            number = (each.codes.astype(np.uint64) * SPREADING) // np.uint64(2**64 // N_FILES)
+            for i in np.unique(number).tolist():
+                files[i].write(records[number == i].tobytes())
+        for file in files:
+            file.seek(0)
+            records = np.frombuffer(file.read(), PRINT)
+            one, other = (records[at] for at in _equal(records["code"], records["run"]))
+            found.append((one["run"], other["run"], other["time_s"] - one["time_s"]))
+    first, second, offset_s = map(np.concatenate, zip(*found, strict=True))
+    order = np.lexsort((offset_s, second, first))
+    first, second, offset_s = first[order], second[order], offset_s[order]
     a, b = slice(None, 1 - MIN_EQUAL), slice(MIN_EQUAL - 1, None)
     near = offset_s[b] - offset_s[a] <= (MIN_EQUAL - 1) * (OFFSET_TOLERANCE_S + 0.1 * MAX_HOLE_S)
     near &= (first[a] == first[b]) & (second[a] == second[b])
     pairs = set(zip(first[a][near].tolist(), second[a][near].tolist(), strict=True))
-    return sorted(pairs.union(_same_digests(each.digest for each in prints)))
+    return sorted(pairs.union(_same_digests(digests)))
 
 
 def _equal(codes: Array, run: Array) -> tuple[Array, Array]:

@@ -689,27 +689,12 @@ def mapped_streams(
 ) -> tuple[dict[str, Stream], tuple[Label, ...]]:
     """Return the streams that the messages of topics become by a mapping, and the intervals of its topic of labels.
 
-    Their time begins at the first stamp unless another is given; when repairing at the first of those in order.
-
-    Parameters
-    ----------
-    place : what messages call the log
-    mapping : of its topics
-    topics : that there are, by name
-    kinds : by type of message those that become channels of their own
-    decoder : returns what makes an object of each message of a topic
-    messages : yields topic, log time in ns and content of each message of some topics
-    wheel_radius_m : of the robot; None where unknown
-    faults : of the log
-    start_ns : stamp at which time begins
-
-    Raises
-    ------
-    LogError
-        if there is no such topic, or one of another type; where a topic has no message, topics of a stream have no
-        stamp in common, stamps go back or repeat, a channel has nothing finite, or there are fewer than two samples.
-    ConfigError
-        if speeds of wheels need the radius and none is known.
+    ``topics`` are those that there are, by name; ``kinds`` by type of message those that become channels of their own;
+    ``decoder`` returns what makes an object of each message of a topic, ``messages`` yields topic, log time in ns and
+    content of each message of some topics.  Time begins at the first stamp unless another is given; when repairing at
+    the first of those in order.  ``LogError`` where there is no such topic, one of another type or without a message,
+    topics of a stream have no stamp in common, or a stream is broken; ``ConfigError`` where speeds of wheels need the
+    radius and none is known.
     """
     sources: dict[str, _Source] = {}
     there, repairs, labels = _described([*topics.values()]), faults.repairs, mapping.labels

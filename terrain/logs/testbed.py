@@ -111,21 +111,10 @@ def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
 def read_trial(
     name: str, wheel: str, index: int, row: int, cells: dict[str, str], fault: str, *, repair: bool = False
 ) -> RunLog:
-    """Return a trial as a run.
+    """Return a trial as a run, the ``index``-th of its file, of its texts by column.
 
-    Parameters
-    ----------
-    name, wheel : what messages call the file, and one of :data:`WHEELS`
-    index, row : of the trial among the rows of data, from 1, and its number as an editor shows it
-    cells : its texts by column
-    fault : of the whole row, empty without one
-    repair : a spread that is not accepted becomes NaN and is counted
-
-    Raises
-    ------
-    LogError
-        if the row has a fault, a cell is no number, a mean is missing or not finite, or the numbers contradict each
-        other.
+    ``LogError`` where the row has a fault, a cell is no number, a mean is missing or not finite, or the numbers
+    contradict each other; a repairing read makes a spread that is not accepted NaN, and counts it.
     """
     at = f"{name}: row {row}"
     if fault:
