@@ -168,8 +168,8 @@ def run_print(run: RunLog) -> RunPrint:
 def possible_pairs(prints: Iterable[RunPrint]) -> list[tuple[int, int]]:
     """Return the pairs of runs, by their places, that may share a stretch; :func:`shared_stretches` decides.
 
-    They have enough equal fingerprints near one offset of their clocks, or equal digests.  Fingerprints wait in files by
-    their value, of which one is read at a time: memory does not grow with the runs.
+    They have enough equal fingerprints near one offset of their clocks, or equal digests.  Fingerprints wait in files
+    by their value, of which one is read at a time: memory does not grow with the runs.
 
     Examples
     --------
