@@ -1,4 +1,4 @@
-"""Whether the value of a cause is one number: by thirds of time, by halves of the runs, and by session.
+"""Whether the value of a cause is one number: by thirds of time, by halves of the runs, by session, run by run.
 
 Every statement is a size, not a test alone: with enough data any difference is significant, and a robot whose
 track is 1.4 m early and 1.5 m late still has an effective track.
@@ -7,7 +7,7 @@ track is 1.4 m early and 1.5 m late still has an effective track.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,19 +16,26 @@ from scipy.stats import chi2
 from scipy.stats import f as fisher
 from scipy.stats import t as student
 
-from terrain.discrepancy.evidence import N_BLOCKS, Evidence
+from terrain.discrepancy import verdict
+from terrain.discrepancy.evidence import (
+    N_BLOCKS,
+    PRIOR_STD,
+    TRUST_DOF,
+    Evidence,
+    clustered_variance,
+    marginal_parts,
+    z_of_t,
+)
 from terrain.discrepancy.robot_terms import value_in_robot_terms
 from terrain.discrepancy.runs import Signals
-from terrain.discrepancy.search import CauseFit
-from terrain.discrepancy.selection import clustered_variance
-from terrain.discrepancy.verdict import AGREE_P, INTERVAL_T, BySession, Cause, SessionValue, Value
-from terrain.effects import Effect
+from terrain.discrepancy.search import RIVAL_LINEAR, RIVAL_LOSS, CauseFit, Problem
+from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect
 from terrain.records import Array
 from terrain.robots import Robot
 
 VARIES_RATIO = 0.5
 """A value whose groups are further apart than that ratio of it, root mean square by their information, is no
-value."""
+value, and none of all runs is one that scatters by more than that ratio from run to run."""
 
 GROWS_RATIO, GROWTH = 0.25, 2.0
 """Nor is one that is apart by the first and grows along runs by the second: a cause that starts from nothing,
@@ -58,31 +65,8 @@ class Constancy(NamedTuple):
     of the value."""
     split: str  #: where that is largest
     certain: bool  #: whether differences are beyond the noise
-
-    @property
-    def varies(self) -> bool:
-        """Whether the value differs so much that it is none."""
-        first, middle, last = self._main("time")
-        sign = 1.0 if last > 0 else -1.0
-        grows = sign * last > GROWTH * abs(first) and sign * last > sign * middle > sign * first
-        least = GROWS_RATIO if self.split == "time" and grows else VARIES_RATIO
-        return self.certain and self.ratio > least
-
-    @property
-    def caveat(self) -> str:
-        """What the value depends on, in words; empty where it is one number."""
-        if not self.certain or self.ratio <= CAVEAT_RATIO:
-            return ""
-        on, names = ("time", THIRDS) if self.split == "time" else ("the run", HALVES)
-        named = zip(self._main(self.split), names, strict=True)
-        shown = ", ".join(f"{value:.3g} in the {name}" for value, name in named if math.isfinite(value))
-        return f"its value depends on {on}: {shown}"
-
-    def _main(self, split: str) -> list[float]:
-        """Return the values of the parameter that is largest over all groups."""
-        values = self.values[split]
-        most: list[float] = values[:, int(np.argmax(np.nan_to_num(np.abs(values)).max(axis=0)))].tolist()
-        return most
+    varies: bool  #: whether the value differs so much that it is none
+    caveat: str  #: what the value depends on, in words; empty where it is one number
 
 
 def constancy_of(
@@ -92,24 +76,35 @@ def constancy_of(
 
     Variances are those from the noise times ``inflation``.
     """
-    n, half = len(info.a), len(info.a) // 2
+    n, half = len(info.grams), len(info.grams) // 2
     where = {"time": np.tile(np.arange(N_BLOCKS), (n, 1))}
     if half >= MIN_HALF_RUNS:
         where["runs"] = np.repeat((np.arange(n) >= half).astype(int)[:, None], N_BLOCKS, axis=1)
     others = [name for name in names if name not in own]
-    every, std, apart = {}, {}, {}
-    for split, group in where.items():
-        values, cov = info.fit(own, others, group)
+    values, std, ratio, split, certain = {}, {}, 0.0, "time", False
+    size = float(np.linalg.norm(change[[list(names).index(name) for name in own]]))
+    for kind, group in where.items():
+        values[kind], cov = info.fit_groups(own, others, group)
         cov = inflation * cov
         variance = np.einsum("gpgp->gp", cov)
-        every[split] = values
-        std[split] = np.where(np.isfinite(values), np.sqrt(np.maximum(variance, 0.0)), np.nan)
-        apart[split] = _difference(values, cov)
-    size = float(np.linalg.norm(change[[list(names).index(name) for name in own]]))
-    certain = [split for split in where if apart[split][1]]
-    most = max(certain, key=lambda split: apart[split][0], default="time")
-    ratio = apart[most][0] / size if size > 0 else math.inf
-    return Constancy(every, std, ratio, most, bool(certain))
+        std[kind] = np.where(np.isfinite(values[kind]), np.sqrt(np.maximum(variance, 0.0)), np.nan)
+        apart, beyond = _difference(values[kind], cov)
+        apart = apart / size if size > 0 else math.inf
+        if kind == "time" or (beyond and (apart > ratio or not certain)):
+            ratio, split, certain = apart, kind, beyond
+    largest = int(np.argmax(np.nan_to_num(np.abs(values[split])).max(axis=0)))
+    first, *_, last = main = values[split][:, largest].tolist()
+    sign = 1.0 if last > 0 else -1.0
+    grows = (
+        split == "time" and sign * last > GROWTH * abs(first) and sign * last > sign * main[1] > sign * first
+    )
+    varies = certain and ratio > (GROWS_RATIO if grows else VARIES_RATIO)
+    caveat = ""
+    if certain and ratio > CAVEAT_RATIO:
+        on, words = ("time", THIRDS) if split == "time" else ("the run", HALVES)
+        shown = [f"{x:.3g} in the {part}" for x, part in zip(main, words, strict=True) if math.isfinite(x)]
+        caveat = f"its value depends on {on}: {', '.join(shown)}"
+    return Constancy(values, std, ratio, split, certain, varies, caveat)
 
 
 def _difference(values: Array, cov: Array) -> tuple[float, bool]:
@@ -118,7 +113,7 @@ def _difference(values: Array, cov: Array) -> tuple[float, bool]:
     A group counts for the parameters that it shows; a parameter that is apart by noise counts only where none
     is apart beyond it.
     """
-    sizes: dict[bool, list[float]] = {False: [0.0], True: []}
+    most = 0.0, False
     for p in range(values.shape[1]):
         known = np.flatnonzero(np.isfinite(values[:, p]))
         if known.size < 2:
@@ -130,20 +125,21 @@ def _difference(values: Array, cov: Array) -> tuple[float, bool]:
         certain = float(chi2.sf(float(off @ precision @ off), known.size - 1)) < CERTAIN_P
         weight = 1.0 / np.maximum(np.diag(own), 1e-30)
         mean = np.average(value, weights=weight)
-        sizes[certain].append(math.sqrt(float(np.average((value - mean) ** 2, weights=weight))))
-    return max(sizes[True] or sizes[False]), bool(sizes[True])
+        apart = math.sqrt(float(np.average((value - mean) ** 2, weights=weight)))
+        most = max(most, (apart, certain), key=lambda pair: (pair[1], pair[0]))
+    return most
 
 
 class PartValues(NamedTuple):
     """A value of a named cause, and those of parts of the data with half their 95 % interval, NaN where not shown."""
 
-    value: Value
+    value: verdict.Value
     names: tuple[str, ...]
     values: Array
     halves: Array
 
 
-def part_values(info: Evidence, causes: Sequence[Cause]) -> tuple[PartValues, ...]:
+def part_values(info: Evidence, causes: Sequence[verdict.Cause]) -> tuple[PartValues, ...]:
     """Return the values of named causes in parts of the data, of evidence with the causes built in."""
     names = [value.name for cause in causes for value in cause.parameters]
     parts = []
@@ -151,13 +147,10 @@ def part_values(info: Evidence, causes: Sequence[Cause]) -> tuple[PartValues, ..
         inflation = max(cause.dispersion, 1.0) if math.isfinite(cause.dispersion) else 1.0
         own = [value.name for value in cause.parameters]
         constant = constancy_of(info, names, own, np.zeros(len(names)), inflation)
-        off, std = (np.concatenate([*groups.values()]) for groups in (constant.values, constant.std))
+        off, std = [np.concatenate([*groups.values()]) for groups in (constant.values, constant.std)]
         for k, value in enumerate(cause.parameters):
-            parts.append(
-                PartValues(
-                    value, (*THIRDS, *HALVES)[: len(off)], value.value + off[:, k], INTERVAL_T * std[:, k]
-                )
-            )
+            half = verdict.INTERVAL_T * std[:, k]
+            parts.append(PartValues(value, (*THIRDS, *HALVES)[: len(off)], value.value + off[:, k], half))
     return tuple(parts)
 
 
@@ -165,7 +158,7 @@ def part_values(info: Evidence, causes: Sequence[Cause]) -> tuple[PartValues, ..
 # Of each session all causes that were found over all runs are fitted to its runs alone.  Fitted with sets of
 # their own, sessions would not be comparable: a track beside a turning slip is another number than one without.
 # The variance of a value is that of the scatter between the runs of its session, weighed with that of the noise
-# as in :mod:`terrain.discrepancy.selection`.
+# as in :func:`terrain.discrepancy.evidence.wald_test`.
 #
 # Sessions of one terrain are compared by Welch's test of equal means (Biometrika 1951), which is Cochran's Q
 # for variances that are estimated themselves; the standard deviation between sessions beyond these variances is
@@ -179,7 +172,7 @@ SHOWN_RATIO = 1e-4
 
 def values_by_session(
     fit: CauseFit, signals: Sequence[Signals], named: Sequence[Effect], robot: Robot
-) -> tuple[BySession, ...]:
+) -> tuple[verdict.BySession, ...]:
     """Return the values of named causes by terrain and session; none where runs (of the fit) are of one session."""
     groups: dict[tuple[str, str], list[int]] = {}
     for i, run in enumerate(signals):
@@ -188,39 +181,33 @@ def values_by_session(
     groups = {key: runs for key, runs in groups.items() if len(runs) >= MIN_RUNS}
     if len(groups) < 2:
         return ()
-    tables = []
-    for parameter in (p for effect in named for p in effect.parameters):
-        for terrain in dict.fromkeys(terrain for terrain, _ in groups):
+    tables, (every_a, every_g) = [], fit.info.clusters(fit.info.places(fit.names))
+    for parameter in [p for effect in named for p in effect.parameters]:
+        own, name = fit.names.index(parameter.name), parameter.name
+        for terrain in dict.fromkeys([terrain for terrain, _ in groups]):
             sessions, fits = [], []
             for (label, session), runs in groups.items():
-                own = _session_fit(fit, runs, parameter.name) if label == terrain else None
-                if own is None:
+                a, g = every_a[runs], every_g[runs]
+                total = a.sum(axis=0)
+                unit = np.sqrt(np.maximum(np.diag(total), 1e-30))
+                scale = np.outer(unit, unit)
+                cov = np.linalg.pinv(total / scale, rcond=1e-10, hermitian=True) / scale
+                size, information = float(cov[own, own]), float(total[own, own])
+                if label != terrain or not (size * information < 1.0 / SHOWN_RATIO and information > 1e-12):
                     continue
-                value, std, dof = own
+                x = cov @ g.sum(axis=0)
+                variance, dof = clustered_variance(a, g, x, cov[own], size)
+                value, std = float(x[own]), math.sqrt(variance * size)
                 half = float(student.ppf(0.975, dof)) * std
-                text = value_in_robot_terms(parameter.name, value, value - half, value + half, robot)
-                sessions.append(SessionValue(session, len(runs), value, (value - half, value + half), text))
-                fits.append(own)
+                text = value_in_robot_terms(name, value, value - half, value + half, robot)
+                about = session, len(runs), value, (value - half, value + half), text
+                sessions.append(verdict.SessionValue(*about))
+                fits.append((value, std, dof))
             if sessions:
                 p, between = agreement(*np.array(fits).T)
-                about = parameter.name, parameter.unit, terrain, tuple(sessions)
-                tables.append(BySession(*about, p, between, not p < AGREE_P))
+                rows, agree = tuple(sessions), not p < verdict.AGREE_P
+                tables.append(verdict.BySession(name, parameter.unit, terrain, rows, p, between, agree))
     return tuple(tables)
-
-
-def _session_fit(fit: CauseFit, runs: Sequence[int], parameter: str) -> tuple[float, float, float] | None:
-    """Return a parameter fitted to some runs beside the others, its standard deviation and degrees."""
-    info = replace(fit.info, grams=fit.info.grams[list(runs)])
-    own, (a, g) = fit.names.index(parameter), info.clusters(info.places(fit.names))
-    total = a.sum(axis=0)
-    unit = np.sqrt(np.maximum(np.diag(total), 1e-30))
-    cov = np.linalg.pinv(total / np.outer(unit, unit), rcond=1e-10, hermitian=True) / np.outer(unit, unit)
-    size = float(cov[own, own])
-    if not size * total[own, own] < 1.0 / SHOWN_RATIO or not total[own, own] > 1e-12:
-        return None
-    x = cov @ g.sum(axis=0)
-    variance, dof = clustered_variance(a, g, x, cov[own], size)
-    return float(x[own]), math.sqrt(variance * size), dof
 
 
 def agreement(value: Array, std: Array, dof: Array) -> tuple[float, float]:
@@ -255,3 +242,299 @@ def agreement(value: Array, std: Array, dof: Array) -> tuple[float, float]:
     p = float(fisher.sf(statistic, k - 1, (k**2 - 1) / (3.0 * loose)))
     spread = total - float((weight**2).sum()) / total
     return p, math.sqrt(max(q - (k - 1), 0.0) / spread)
+
+
+# -- Effects whose size differs from run to run: how much, and whether the runs fall into two groups --------
+# Runs are fitted with values of their own of one effect at a time, by a mixed model in which all else varies by
+# no more than is assumed.  The answer is the effect with the greatest likelihood: what half of the wheels do is
+# not the scatter of a track, though a scatter of the track that is estimated beside it would take most of it.
+#
+# Whether an effect varies is judged by the likelihood that is lost with one value for all runs.  The noise of a
+# run's value is that between the thirds of each run, since noise that lasts is in both.
+
+Z_VARIES = 4.5  #: Evidence of a difference between runs, as of a probe: of some thirty effects
+Z_NEAR = 3.0  #: Evidence of an effect that may be what varies instead of one whose evidence is enough
+
+TWO_GROUPS_RATIO = 0.15
+"""Part of the scatter that two groups leave: a uniform distribution, cut in its middle, leaves 0.25."""
+
+MIN_GROUP = 2  #: Least number of runs in a group
+
+OUT_STDS, OUT_SCATTERS, OUT_RATIO = 3.0, 0.25, 0.2
+"""A run's value is out of its bounds by so many standard deviations and scatters, and the ratio of the runs
+that may be: a rogue or two, and less than a group of eight runs."""
+
+LEAST_RATIO = 1e-4  #: Least scatter of a parameter of which none is assumed, over the prior of its value
+
+NEAR_RATIO, N_STEPS = 0.2, 3
+"""Effects whose loss is behind by that ratio of the best one's gain are compared by nonlinear fits of so many
+steps: a run's own value may be far from where sensitivities were taken."""
+
+SCATTERS = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 40)])
+"""Scatters that are tried, over the range of the values."""
+
+
+class RunValues(NamedTuple):
+    """Values (runs,) of a parameter by each run alone, and how far they scatter beyond the noise."""
+
+    name: str
+    value: Array  #: over what the simulation has of it
+    weight: Array  #: precision of each, 0 where a run shows nothing
+    scatter: float
+    z: float
+
+
+class _OwnValues(NamedTuple):
+    """An effect of which each run has its own values, by parameter, and how well that fits."""
+
+    effect: Effect
+    runs: list[RunValues]
+    loss: float
+    gain: float  #: fall of the loss from one value in all runs
+
+    @property
+    def clearest(self) -> RunValues:
+        """The parameter that differs most clearly."""
+        return max(self.runs, key=lambda runs: runs.z)
+
+
+def run_scatter(problem: Problem, fit: CauseFit, name: str) -> float:
+    """Return the scatter from run to run of a parameter, noise taken off."""
+    assumed = problem.simulation.known_scatter.get(name, 0.0)
+    return values_by_run(fit.info, name, fit.names, fit.change, fit.info.scatter, assumed).scatter
+
+
+def varying_effects(problem: Problem, fit: CauseFit) -> tuple[verdict.Varying, ...]:
+    """Return the effect whose size differs most clearly from run to run; none where runs are alike.
+
+    Only one is returned: what one effect varies by looks like a variation of all that resemble it.
+    """
+    info, known = fit.info, problem.simulation.known_scatter
+    if len(info.rows) < 2 * MIN_GROUP:
+        return ()
+    # what was assumed of a parameter is no news, other than what was estimated
+    least = {name: known.get(name, 0.0) or LEAST_RATIO * PRIOR_STD[name] for name in info.scatter}
+    tried = []
+    for effect in problem.library:
+        runs = [
+            values_by_run(info, p.name, fit.names, fit.change, least, known.get(p.name, 0.0))
+            for p in effect.parameters
+        ]
+        tried.append(_OwnValues(effect, runs, 0.0, 0.0))
+    if not max([own.clearest.z for own in tried]) > Z_VARIES:
+        return ()
+    tried = [_own_values(fit, info, own, known) for own in tried if own.clearest.z > Z_NEAR]
+    first = min(tried, key=lambda own: own.loss)
+    behind = max(RIVAL_LINEAR, NEAR_RATIO * first.gain)
+    near: list[tuple[_OwnValues, _OwnValues]] = []
+    for linear in tried:
+        if linear.loss > first.loss + behind:
+            continue
+        # by a nonlinear fit: sensitivities of each run at its own values
+        own, names = linear, tuple(dict.fromkeys([*fit.names, *[runs.name for runs in linear.runs]]))
+        for _ in range(N_STEPS):
+            values = {
+                runs.name: np.clip(info.vector[INDEX[runs.name]] + runs.value, *BOUNDS[runs.name])
+                for runs in own.runs
+            }
+            there = problem.at(info.origin, names, noise=info.noise, scatter=info.scatter, own=values)
+            own = _own_values(fit, there.counted_from(info.vector), own, known)
+        of = own.clearest
+        (low, high), seen = BOUNDS[of.name], of.weight > 0
+        value = info.vector[INDEX[of.name]] + of.value[seen]
+        margin = OUT_STDS / np.sqrt(of.weight[seen]) + OUT_SCATTERS * of.scatter
+        if np.mean((value < low - margin) | (value > high + margin)) <= OUT_RATIO:
+            near.append((own, linear))
+    if not near:
+        return ()
+    best, straight = min(near, key=lambda pair: pair[0].loss)
+    # a mass makes more or less of the noise of the wheels, which a nonlinear fit counts: either may say so
+    alike = [
+        own for own, linear in near if min(own.loss - best.loss, linear.loss - straight.loss) < RIVAL_LOSS
+    ]
+    if not max([own.clearest.z for own in alike]) > Z_VARIES:
+        return ()
+    of, rivals = best.clearest, tuple([own.effect.name for own in alike if own is not best])
+    name, mean = best.effect.name, float(np.average(of.value, weights=of.weight))
+    channel = CHANNELS[int(np.argmax(info.channel_power(np.eye(len(info.names))[info.places([of.name])])))]
+    about = of.name.rpartition("_")[2], rivals, mean, of.scatter, of.z
+    return (verdict.Varying(name, of.name, *about, _two_groups(of, [r.run_id for r in info.rows]), channel),)
+
+
+def _own_values(fit: CauseFit, info: Evidence, tried: _OwnValues, known: Mapping[str, float]) -> _OwnValues:
+    """Fit runs with values of their own of an effect, all else as it is assumed, from a scatter of its parameters."""
+    own = [runs.name for runs in tried.runs]
+    names = tuple(dict.fromkeys([*fit.names, *own]))
+    least = {
+        name: known.get(name, 0.0) or LEAST_RATIO * PRIOR_STD[name]
+        for name in [*[name for name in info.scatter if name not in own], *own]
+    }
+    least_std, q = np.array([*least.values()]), len(least) - len(own)
+    free = np.arange(len(least)) >= q
+    start = np.concatenate([least_std[:q], [runs.scatter for runs in tried.runs]])
+    model = info.grams.sum(axis=1), info.places(names), info.places([*least]), least_std
+    loss, shared, std = fit_mixed(*model, start, free)
+    alike = fit_mixed(*model, least_std, np.zeros_like(free))[0]
+    varies = dict(zip(least, std.tolist(), strict=True))
+    runs = [values_by_run(info, name, names, shared, varies, known.get(name, 0.0)) for name in own]
+    return _OwnValues(tried.effect, runs, loss, alike - loss)
+
+
+def values_by_run(
+    info: Evidence,
+    name: str,
+    names: Sequence[str],
+    shared: Array,
+    scatter: Mapping[str, float],
+    assumed_std: float,
+) -> RunValues:
+    """Return the values of a parameter by each run, with all that varies (``scatter``) beside it marginalised.
+
+    All runs share values (m,) of parameters by name.  Values are compared between runs with those between thirds of
+    each run; ``assumed_std`` is what they may differ by.
+    """
+    (place,), beside = info.places([name]), [other for other in scatter if other != name]
+    q, std = len(beside), np.array([scatter[other] for other in beside])
+    columns = np.zeros((len(info.names) + 1, q + 2))  # what varies, the parameter, and the residual
+    columns[info.places(beside), np.arange(q)] = 1.0
+    columns[place, q] = 1.0
+    columns[info.places(names), -1] = -shared
+    columns[-1, -1] = 1.0
+    taken = marginal_parts(columns.T @ info.grams @ columns, np.arange(q), std)[:, :, q:, q:]
+    mean = float(shared[list(names).index(name)]) if name in names else 0.0
+    score, weight = taken[:, :, 0, 1], taken[:, :, 0, 0]
+    total = weight.sum(axis=1)
+    seen = total > 1e-6 * max(float(total.max()), 1e-30)
+    if seen.sum() < 2 * MIN_GROUP or not total.max() > 0:
+        return RunValues(name, np.zeros(len(total)), np.ones(len(total)), 0.0, 0.0)
+    value = np.where(seen, score.sum(axis=1) / np.where(seen, total, 1.0), 0.0)
+    use = seen[:, None] & (weight > 0.05 * total[:, None])
+    apart = (score - weight * value[:, None]) ** 2 / np.where(use, weight, 1.0)
+    inside, dof = float(apart[use].sum()), int(np.maximum(use.sum(axis=1) - 1, 0).sum())
+    # thirds of a run share its deviations, most of the variance of a short one: no less than by whitening
+    noise = max((TRUST_DOF + inside) / (TRUST_DOF + dof), 1.0)
+    precision = np.where(seen, 1.0 / (noise / np.where(seen, total, 1.0) + assumed_std**2), 0.0)
+    # one run that is far out is no variation from run to run: the others have to differ as well
+    known = np.flatnonzero(seen)
+    rests = [np.delete(known, i) for i in range(len(known))]
+    likelihood = min([_likelihood_ratio(value[rest], precision[rest]) for rest in rests])
+    z = z_of_t(math.sqrt(max(likelihood, 0.0)), TRUST_DOF + dof)
+    # squares about the mean, in variances, those far out limited
+    square = precision * (value - (precision * value).sum() / precision.sum()) ** 2
+    square = np.minimum(square, 9.0 * max(float(np.median(square[precision > 0])), 1.0))
+    beyond = float(square.sum()) - (len(known) - 1)
+    spread = float(precision.sum() - (precision**2).sum() / precision.sum())
+    return RunValues(name, value + mean, precision, math.sqrt(max(beyond / spread, 0.0) + assumed_std**2), z)
+
+
+def _likelihood_ratio(value: Array, precision: Array) -> float:
+    """Return the fall of minus twice the log-likelihood where values have a scatter of their own."""
+    variance = 1.0 / precision + (SCATTERS[:, None] * np.ptp(value)) ** 2
+    mean = (value / variance).sum(axis=1) / (1.0 / variance).sum(axis=1)
+    loss = (np.log(variance) + (value - mean[:, None]) ** 2 / variance).sum(axis=1)
+    return float(loss[0] - loss.min())
+
+
+def _two_groups(best: RunValues, run_ids: Sequence[str]) -> tuple[verdict.RunGroup, ...]:
+    """Return two groups of runs, if values fall into two; none if they do not."""
+    order = [i for i in np.argsort(best.value, kind="stable") if best.weight[i] > 0]
+    value, weight = best.value[order], best.weight[order]
+
+    def square(part: slice) -> float:
+        v, w = value[part], weight[part]
+        return float((w * (v - np.average(v, weights=w)) ** 2).sum())
+
+    cuts = range(MIN_GROUP, len(order) - MIN_GROUP + 1)
+    left = {k: square(slice(0, k)) + square(slice(k, None)) for k in cuts}
+    cut = min(left, key=lambda k: left[k], default=0)
+    if not cut or max(left[cut] - (len(order) - 2), 0.0) > TWO_GROUPS_RATIO * square(slice(None)):
+        return ()
+    groups = []
+    for part in (slice(0, cut), slice(cut, None)):
+        mean, std = np.average(value[part], weights=weight[part]), 1.0 / math.sqrt(weight[part].sum())
+        groups.append(verdict.RunGroup(float(mean), std, tuple(sorted([run_ids[i] for i in order[part]]))))
+    return tuple(groups)
+
+
+# -- Linear mixed model of runs: parameters that all runs share, and such of which each run has its own value --
+# Of each run ``i`` the whitened residual is ``X_i x + N_i b_i + e_i`` with ``b_i ~ N(0, D)``, ``D`` diagonal.
+# Shared values ``x``, and those of the variances ``D`` that are free, are of greatest likelihood, found by
+# expectation and maximisation (Laird and Ware, Biometrics 1982): with ``G = N'N``,
+#
+#     V = (G + D^-1)^-1,   x = generalised least squares,   b = V N'(r - X x),   D <- mean of b^2 + V over runs.
+#
+# Minus twice the log-likelihood is, up to a constant, ``sum |r - X x|^2 - b'(G + D^-1) b + log det(1 + G D)``:
+# what a parameter costs that may differ from run to run is the last term.
+
+EM_STEPS = 30  #: Enough from a start that is not far too small: variances then fall to where they belong
+
+
+def fit_mixed(
+    gram: Array, shared: Sequence[int], own: Sequence[int], least_std: Array, start_std: Array, free: Array
+) -> tuple[float, Array, Array]:
+    """Return the fit of greatest likelihood.
+
+    Parameters
+    ----------
+    gram : (runs, k + 1, k + 1) products of the whitened columns of each run, the residual last
+    shared, own : places of the m parameters that all runs share, and of the q that differ about them
+    least_std, start_std : (q,) least standard deviations, and those to start from, both above zero
+    free : (q,) whether a standard deviation is estimated; the others stay as they start
+
+    Returns
+    -------
+    loss : minus twice the log-likelihood, up to what no choice of parameters changes
+    values : (m,) that all runs share
+    std : (q,) standard deviations of the values that each run has of its own
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> columns = rng.standard_normal((200, 50, 1))
+    >>> values = 1.0 + 0.5 * rng.standard_normal((200, 1))
+    >>> residual = columns[:, :, 0] * values + 0.1 * rng.standard_normal((200, 50))
+    >>> both = np.concatenate([columns, residual[:, :, None]], axis=2) / 0.1
+    >>> gram, least = both.transpose(0, 2, 1) @ both, np.array([1e-3])
+    >>> _, shared, std = fit_mixed(gram, [0], [0], least, np.ones(1), np.array([True]))
+    >>> bool(abs(shared[0] - 1.0) < 0.1), bool(abs(std[0] - 0.5) < 0.1)
+    (True, True)
+    """
+    outer, m = [*shared, gram.shape[1] - 1], len(shared)
+    inside, cross = gram[:, own][:, :, own], gram[:, own][:, :, outer]
+    outside = gram[:, outer][:, :, outer].sum(axis=0)
+    std = np.maximum(start_std, least_std)
+    for step in range(EM_STEPS + 1):
+        inner = np.linalg.inv(inside + np.diag(1.0 / std**2))
+        follow = inner @ cross
+        total = outside - (cross.transpose(0, 2, 1) @ follow).sum(axis=0)
+        values = np.linalg.lstsq(total[:m, :m], total[:m, m], rcond=1e-10)[0] if m else np.zeros(0)
+        if step < EM_STEPS:
+            deviation = follow @ np.concatenate([-values, [1.0]])
+            square = (deviation**2 + np.einsum("iqq->iq", inner)).mean(axis=0)
+            std = np.where(free, np.maximum(np.sqrt(square), least_std), std)
+    scaled = np.eye(len(std)) + std[:, None] * inside * std
+    loss = float(total[m, m] - values @ total[:m, m] + np.linalg.slogdet(scaled)[1].sum())
+    return loss, values, std
+
+
+# -- Conditions that differ from run to run, as the load or the moisture of the soil: what they may explain --
+# A quantity that is never below none, as a load, has a mean of ``sqrt(3)`` times its standard deviation where
+# it is spread evenly from none.  So where the values of single runs scatter by ``s``, a mean over runs of up to
+# ``sqrt(3) s`` is what conditions explain, up to what they are known to make; the rest is news.
+
+MEAN_PER_SCATTER = math.sqrt(3.0)  #: Mean over standard deviation of what is spread evenly from none
+
+
+def with_conditions(problem: Problem, info: Evidence) -> Problem:
+    """Return the problem with the error that conditions make which differ between its runs.
+
+    Its simulation has what they may make at the most.
+    """
+    simulation = problem.simulation
+    error = dict(simulation.model_error)
+    for name, most in simulation.varied_error.items():
+        if name in [effect.parameters[0].name for effect in problem.library]:
+            assumed = simulation.scatter.get(name, 0.0)
+            scatter = values_by_run(info, name, (), np.zeros(0), info.scatter, assumed).scatter
+            error[name] = math.hypot(error.get(name, 0.0), min(MEAN_PER_SCATTER * scatter, most))
+    return problem._replace(simulation=replace(simulation, model_error=error))

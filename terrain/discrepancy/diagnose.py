@@ -10,36 +10,20 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.clocks import Latencies, Shift, latencies_of, shifts_of
-from terrain.discrepancy.constancy import CAVEAT_RATIO, Constancy, constancy_of, values_by_session
-from terrain.discrepancy.evidence import Evidence, fit_change, move_point, partial_information
+from terrain.discrepancy import constancy, verdict
+from terrain.discrepancy.clocks import Shift, latencies_of, shifts_of
+from terrain.discrepancy.evidence import EXCITED_RATIO, Z_EFFECT, Evidence, move_point, partial_information
 from terrain.discrepancy.health import Excluded, Fault, clocks_of, faults_of, repaired, unfit_runs
 from terrain.discrepancy.next_drive import MOST, next_drive
 from terrain.discrepancy.probes import TILT_INPUTS, ProbeResult, probe_residuals
 from terrain.discrepancy.robot_terms import UNITS
 from terrain.discrepancy.runs import Signals, Simulation, low_pass_of, measured_channels, rows_of, signals_of
 from terrain.discrepancy.search import CauseFit, Problem, names_of, pooled, refit, rivals_of, search
-from terrain.discrepancy.selection import EXCITED_RATIO, Z_EFFECT, fits_without_each, gain_interval
-from terrain.discrepancy.varying import VARIES_RATIO, run_scatter, varying_effects, with_conditions
-from terrain.discrepancy.verdict import (
-    INTERVAL_T,
-    Cause,
-    Covariance,
-    Diagnosis,
-    Limit,
-    Residual,
-    RuledOut,
-    Unexplained,
-    Value,
-    Varying,
-    Verdict,
-)
+from terrain.discrepancy.verdict import Verdict
 from terrain.effects import BOUNDS, CHANNELS, Effect, effect_named
 from terrain.errors import DataError
 from terrain.records import Array, RunLog
@@ -59,7 +43,7 @@ POWER_Z = 1.28  #: Added to the threshold, so that nine in ten are detected
 
 def diagnose(
     runs: Sequence[RunLog], simulation: Simulation, library: Sequence[Effect] | None = None
-) -> Diagnosis:
+) -> verdict.Diagnosis:
     """Return what a simulation gets wrong about measured runs.
 
     Parameters
@@ -74,73 +58,140 @@ def diagnose(
         if runs are of another robot, too few, of one id, or too short, or have no channel in common with the
         simulation, or if too few are consistent with each other.
     """
-    ids = Counter(run.run_id for run in runs)
+    ids = Counter([run.run_id for run in runs])
     if twice := [run_id for run_id, n in ids.items() if n > 1]:
         raise DataError(f"runs: {twice[0]!r} is the id of {ids[twice[0]]} runs; each needs its own")
     if len(runs) < MIN_RUNS:
         raise DataError(f"runs: there are {len(runs)}, at least {MIN_RUNS} are required, to hold some out")
+    signals = [signals_of(run, simulation.robot) for run in runs]
     effects = simulation.library if library is None else tuple(library)
-    prepared = prepare([signals_of(run, simulation.robot) for run in runs], simulation, effects)
-    problem = with_conditions(prepared.problem, prepared.aligned)
-    same = problem is prepared.problem and not prepared.seeds
-    start = prepared.aligned if same else problem.at(simulation.vector)
-    withdrawn: dict[str, RuledOut] = {}
-    fit = _withdraw_wrong(problem, start, search(problem, start, prepared.seeds), withdrawn)
-    varying = varying_effects(problem, fit)
-    if _is_beside(problem, fit, varying):
+    prepared, faults, excluded, seeds, aligned, shift = prepare(signals, simulation, effects)
+
+    # causes, their values and what they leave
+    problem = constancy.with_conditions(prepared, aligned)
+    start = aligned if problem is prepared and not seeds else problem.at(simulation.vector)
+    withdrawn: dict[str, verdict.RuledOut] = {}
+    fit = _withdraw_wrong(problem, search(problem, start, seeds), withdrawn)
+    varying = constancy.varying_effects(problem, fit)
+    varies = {name for effect in varying for name in (effect.name, *effect.rivals)}
+    others = [cause for cause in fit.causes if cause.name not in varies]
+    if varying and varying[0].parameter not in problem.scatter and others:
+        # what one value of all runs leaves of an effect that varies may look like causes: each run has its own
         problem = problem._replace(varying={varying[0].parameter: varying[0].scatter})
-        info = replace(problem.at(fit.info.origin), vector=start.vector)
         again = list(dict.fromkeys([*fit.causes, effect_named(varying[0].name)]))
-        fit = _withdraw_wrong(problem, start, refit(problem, start, info, again), withdrawn)
-    fit = _withdraw_varying(problem, start, fit, withdrawn, varying)
+        info = problem.at(fit.info.origin).counted_from(start.vector)
+        fit = _withdraw_wrong(problem, refit(problem, info, again), withdrawn)
+    for cause in fit.causes:
+        if (
+            cause.name in varies and cause in fit.causes
+        ):  # which others may have left with one withdrawn before
+            k = max(fit.at(cause), key=lambda k: abs(fit.change[k]))
+            value, scatter = abs(fit.change[k]), constancy.run_scatter(problem, fit, fit.names[k])
+            if scatter > constancy.VARIES_RATIO * value:
+                reason = f"its value differs from run to run, by {scatter:.3g} about a size of {value:.3g}"
+                fit = _withdraw(problem, fit, cause, reason, withdrawn)
     fit = pooled(problem, fit._replace(rivals=rivals_of(problem, fit.info, start, fit.causes)))
-    unexplained = _unexplained_channels(problem, fit, withdrawn, varying)
-    named, sets = _named_and_ambiguous(fit)
-    causes, parameters = tuple(cause_of(fit, effect) for effect in named), names_of(named)
-    limits = limits_of(fit, problem.library)
-    missed = tuple(
-        limit
-        for limit in limits
-        if limit.detection_limit > EXCITED_RATIO * MOST[limit.name] and limit.name not in parameters
-    )
+
+    # channels that depend on an input, the most significant of each, or on a cause that was withdrawn
+    best: dict[str, verdict.Unexplained] = {}
+    power = sum([(left**2).sum(axis=0) for left in fit.info.residuals(fit.info.away)])
+    for (channel, name), probe in _probes(problem, fit).items():
+        if probe.significant and (channel not in best or probe.z > best[channel].z):
+            ratio = min(probe.gain / float(power[CHANNELS.index(channel)]), 1.0)
+            best[channel] = verdict.Unexplained(channel, name, probe.z, ratio)
+    for out in withdrawn.values():
+        channel = shown_beside(fit, effect_named(out.name))
+        if channel not in best and out.name not in varies:
+            best[channel] = verdict.Unexplained(channel, out.name, out.z, 0.0)
+    unexplained = tuple(sorted(best.values(), key=lambda left: -left.z))
+
+    # what is named, and sets of which one is present
+    members = {cause.name: (cause.name, *fit.rivals[cause.name]) for cause in fit.causes}
+    significant = [cause for cause in fit.causes if fit.tests[cause.name].significant]
+    named = [cause for cause in significant if not fit.rivals[cause.name]]
+    sets = [members[cause.name] for cause in significant if fit.rivals[cause.name]]
+    std = np.sqrt(np.diag(fit.cov))
+    for one, other in combinations(fit.causes, 2):
+        i, j = fit.at(one), fit.at(other)
+        entangled = np.abs(fit.cov[np.ix_(i, j)]) > ENTANGLED * np.outer(std[i], std[j])
+        if (one in named or other in named) and entangled.any():
+            sets = [names for names in sets if names[0] not in (one.name, other.name)]
+            sets.append(tuple(dict.fromkeys((*members[one.name], *members[other.name]))))
+            named = [cause for cause in named if cause not in (one, other)]
+    values = {cause.name: values_of(fit, cause) for cause in fit.causes}
+    for rivals in fit.rivals.values():
+        for name, (change, error) in rivals.items():
+            values.setdefault(name, _values(effect_named(name), change, error))
+    parameters = names_of(named)
     at = [fit.names.index(name) for name in parameters]
     inflation = np.array([fit.tests[effect.name].inflation for effect in named for _ in effect.parameters])
     cov = fit.cov[np.ix_(at, at)] * np.sqrt(np.outer(inflation, inflation))
+
+    # what could not have been detected beside it, and what is not the answer
+    limits, a = [], fit.info.a.sum(axis=0)
+    for effect in effects:
+        base = fit.info.places([name for name in fit.names if name not in names_of([effect])])
+        for parameter in effect.parameters:
+            (k,) = fit.info.places([parameter.name])
+            free = float(partial_information(a, base, [k])[1][0, 0])
+            shown = free > 1e-9 * max(a[k, k], 1e-12)
+            limit = (Z_EFFECT + POWER_Z) / float(np.sqrt(free)) if shown else np.inf
+            limits.append(verdict.Limit(parameter.name, limit, parameter.unit, effect.needs))
+    missed = [
+        limit
+        for limit in limits
+        if limit.detection_limit > EXCITED_RATIO * MOST[limit.name] and limit.name not in parameters
+    ]
+    ruled_out = list(withdrawn.values())
+    answered = {*[effect.name for effect in named], *[name for names in sets for name in names], *withdrawn}
+    for effect in effects:
+        test = fit.tests[effect.name]
+        if effect.name in answered:
+            continue
+        if effect in fit.causes:
+            reason = "it is not significant beside the other causes"
+        elif not test.inside:
+            reason = "the fitted value is out of its bounds"
+        elif test.z <= Z_EFFECT:
+            reason = "it is not significant beside what was found"
+        else:
+            reason = "it does not reduce the residual of runs left out, or differs from run to run"
+        own = values[effect.name] if effect in fit.causes else ()
+        ruled_out.append(verdict.RuledOut(effect.name, reason, test.z, own))
     verdicts = {
         Verdict.AMBIGUOUS: sets,
-        Verdict.EXPLAINED: causes,
+        Verdict.EXPLAINED: named,
         Verdict.VARIES: varying,
         Verdict.UNEXPLAINED: unexplained,
         Verdict.NOT_EXCITED: len(missed) > BLIND_RATIO * len(limits),
         Verdict.NONE: True,
     }
     built_in = problem.simulation.with_effects(dict(zip(parameters, fit.change[at].tolist(), strict=True)))
-    return Diagnosis(
+    after = problem.at(built_in.vector, (), noise=fit.info.noise, scatter=fit.info.scatter)
+    return verdict.Diagnosis(
         robot=simulation.robot.name,
-        verdict=next(verdict for verdict, holds in verdicts.items() if holds),
-        causes=causes,
-        covariance=Covariance(parameters, cov),
+        verdict=next(name for name, holds in verdicts.items() if holds),
+        causes=tuple([cause_of(problem, fit, effect) for effect in named]),
+        covariance=verdict.Covariance(parameters, cov),
         ambiguous_sets=tuple(sets),
-        ambiguous_values=rival_values(fit, sets),
+        ambiguous_values={name: values[name] for names in sets for name in names},
         unexplained=unexplained,
-        detection_limits=limits,
-        not_excited=missed,
-        ruled_out=ruled_out_of(fit, named, sets, withdrawn, problem.library),
-        excluded_runs=prepared.excluded,
-        clocks=clocks_of(prepared.aligned, prepared.shift),
+        detection_limits=tuple(limits),
+        not_excited=tuple(missed),
+        ruled_out=tuple(ruled_out),
+        excluded_runs=excluded,
+        clocks=clocks_of(aligned, shift),
         next_drive=next_drive(simulation, sets, missed, fit.info),
         residual_before=residuals_of(start, start),
-        residual_after=residuals_of(problem.at(built_in.vector, (), fit.info.statistics), start),
+        residual_after=residuals_of(after, start),
         n_runs=len(problem.signals),
         varying=varying,
-        faults=prepared.faults,
-        by_session=values_by_session(fit, problem.signals, named, simulation.robot),
+        faults=faults,
+        by_session=constancy.values_by_session(fit, problem.signals, named, simulation.robot),
     )
 
 
-def _withdraw_wrong(
-    problem: Problem, start: Evidence, fit: CauseFit, withdrawn: dict[str, RuledOut]
-) -> CauseFit:
+def _withdraw_wrong(problem: Problem, fit: CauseFit, withdrawn: dict[str, verdict.RuledOut]) -> CauseFit:
     """Return the causes that may be named; those that were withdrawn are noted by name.
 
     One is withdrawn at a time, the one that gains least, and the others are fitted anew: a wrong cause
@@ -151,55 +202,19 @@ def _withdraw_wrong(
         if not reasons:
             break
         doubtful = [cause for cause in fit.causes if cause.name in reasons]
-        gains = [raw_gain(fit, cause) for cause in doubtful]
-        worst = doubtful[int(np.argmin(gains))]
-        fit = _withdraw(problem, start, fit, worst, reasons[worst.name], withdrawn)
+        worst = min(doubtful, key=lambda cause: raw_gain(fit, cause))
+        fit = _withdraw(problem, fit, worst, reasons[worst.name], withdrawn)
     return fit
 
 
 def _withdraw(
-    problem: Problem,
-    start: Evidence,
-    fit: CauseFit,
-    cause: Effect,
-    reason: str,
-    withdrawn: dict[str, RuledOut],
+    problem: Problem, fit: CauseFit, cause: Effect, reason: str, withdrawn: dict[str, verdict.RuledOut]
 ) -> CauseFit:
     """Note why a cause is withdrawn, and return the others, fitted without it."""
-    withdrawn[cause.name] = RuledOut(cause.name, reason, fit.tests[cause.name].z, values_of(fit, cause))
+    z, values = fit.tests[cause.name].z, values_of(fit, cause)
+    withdrawn[cause.name] = verdict.RuledOut(cause.name, reason, z, values)
     others = [other for other in fit.causes if other is not cause and other.modifies != cause.name]
-    return refit(problem, start, fit.info, others)
-
-
-def _is_beside(problem: Problem, fit: CauseFit, varying: Sequence[Varying]) -> bool:
-    """Return whether causes were found beside an effect that varies, of which runs had one value.
-
-    What that value leaves may look like causes: they are fitted again with a value of each run.
-    """
-    return any(
-        effect.parameter not in problem.scatter and cause.name not in (effect.name, *effect.rivals)
-        for effect in varying
-        for cause in fit.causes
-    )
-
-
-def _withdraw_varying(
-    problem: Problem,
-    start: Evidence,
-    fit: CauseFit,
-    withdrawn: dict[str, RuledOut],
-    varying: Sequence[Varying],
-) -> CauseFit:
-    """Withdraw causes whose value is no value of all runs, since it differs from run to run."""
-    for effect in varying:
-        for cause in fit.causes:
-            sizes = {p.name: abs(fit.change[fit.names.index(p.name)]) for p in cause.parameters}
-            name, value = max(sizes.items(), key=lambda item: item[1])
-            scatter = run_scatter(fit, name)
-            if cause.name in (effect.name, *effect.rivals) and scatter > VARIES_RATIO * value:
-                reason = f"its value differs from run to run, by {scatter:.3g} about a size of {value:.3g}"
-                fit = _withdraw(problem, start, fit, cause, reason, withdrawn)
-    return fit
+    return refit(problem, fit.info, others)
 
 
 def _probes(problem: Problem, fit: CauseFit) -> dict[tuple[str, str], ProbeResult]:
@@ -208,43 +223,6 @@ def _probes(problem: Problem, fit: CauseFit) -> dict[tuple[str, str], ProbeResul
     if all(problem.simulation.tilt_is_slope(run.terrain) for run in problem.signals):
         return results
     return {at: probe for at, probe in results.items() if at[1] not in TILT_INPUTS}
-
-
-def _unexplained_channels(
-    problem: Problem, fit: CauseFit, withdrawn: Mapping[str, RuledOut], varying: Sequence[Varying]
-) -> tuple[Unexplained, ...]:
-    """Return the most significant input of every channel that depends on one."""
-    best: dict[str, Unexplained] = {}
-    size = dict(zip(CHANNELS, sum((white[-1] ** 2).sum(axis=0) for white in fit.info.white), strict=True))
-    for (channel, name), probe in _probes(problem, fit).items():
-        if probe.significant and (channel not in best or probe.z > best[channel].z):
-            best[channel] = Unexplained(channel, name, probe.z, min(probe.gain / float(size[channel]), 1.0))
-    varies = {name for effect in varying for name in (effect.name, *effect.rivals)}
-    for cause in withdrawn.values():
-        channel = shown_beside(fit, effect_named(cause.name))
-        if channel not in best and cause.name not in varies:
-            best[channel] = Unexplained(channel, cause.name, cause.z, 0.0)
-    return tuple(sorted(best.values(), key=lambda left: -left.z))
-
-
-def _named_and_ambiguous(fit: CauseFit) -> tuple[list[Effect], list[tuple[str, ...]]]:
-    """Return the causes that are named, and the ambiguous sets."""
-    members = {
-        cause.name: (cause.name, *(rival.effect.name for rival in fit.rivals[cause.name]))
-        for cause in fit.causes
-    }
-    significant = [cause for cause in fit.causes if fit.tests[cause.name].significant]
-    named = [cause for cause in significant if not fit.rivals[cause.name]]
-    sets = [members[cause.name] for cause in significant if fit.rivals[cause.name]]
-    std = np.sqrt(np.diag(fit.cov))
-    for one, other in combinations(fit.causes, 2):
-        i, j = ([fit.names.index(p.name) for p in effect.parameters] for effect in (one, other))
-        entangled = np.abs(fit.cov[np.ix_(i, j)]) > ENTANGLED * np.outer(std[i], std[j])
-        if (one in named or other in named) and entangled.any():
-            sets = [names for names in sets if names[0] not in (one.name, other.name)]
-            sets.append(tuple(dict.fromkeys((*members[one.name], *members[other.name]))))
-            named = [cause for cause in named if cause not in (one, other)]
-    return named, sets
 
 
 # -- Why causes that reduce the residual are withdrawn all the same: a reason a rule, with its numbers ------
@@ -264,14 +242,6 @@ SLOW_CUTOFF_RATIO, SLOW_Z, SLOW_RATIO = 0.5, 3.0, 0.3
 sensitivities are computed along instruments of that ratio of the cut-off."""
 
 
-class ChannelEffect(NamedTuple):
-    """What a cause does to one channel: whitened squares without and with it, and the held-out gain."""
-
-    without: float
-    with_cause: float
-    held_out_gain: float
-
-
 def _own_and_base(fit: CauseFit, effect: Effect) -> tuple[list[int], list[int]]:
     """Return the places of the parameters of an effect, and of the others that were fitted."""
     own = [p.name for p in effect.parameters]
@@ -284,7 +254,7 @@ def shown_channels(fit: CauseFit, cause: Effect) -> tuple[str, ...]:
     weights[0, _own_and_base(fit, cause)[0]] = fit.tests[cause.name].change
     power = fit.info.channel_power(weights)
     order = np.argsort(-power)
-    return tuple(CHANNELS[i] for i in order if power[i] > 0.1 * power[order[0]])
+    return tuple([CHANNELS[i] for i in order if power[i] > 0.1 * power[order[0]]])
 
 
 def shown_beside(fit: CauseFit, effect: Effect) -> str:
@@ -305,33 +275,45 @@ def raw_gain(fit: CauseFit, cause: Effect) -> float:
     It is on the scale of the gain of a probe, without the scatter between runs, which ``z`` has in it.
     """
     own, base = _own_and_base(fit, cause)
-    free = partial_information(fit.info.a.sum(axis=0), base, own)[1]
-    change = fit.change[[fit.names.index(p.name) for p in cause.parameters]]
-    return float(change @ free @ change)
+    change = fit.change[fit.at(cause)]
+    return float(change @ partial_information(fit.info.a.sum(axis=0), base, own)[1] @ change)
 
 
-def constancy_of_cause(fit: CauseFit, cause: Effect) -> Constancy:
+def constancy_of_cause(fit: CauseFit, cause: Effect) -> constancy.Constancy:
     """Return the values of a cause in parts of the data."""
-    own = [p.name for p in cause.parameters]
-    return constancy_of(fit.info, fit.names, own, fit.change, fit.tests[cause.name].inflation)
+    own, inflation = [p.name for p in cause.parameters], fit.tests[cause.name].inflation
+    return constancy.constancy_of(fit.info, fit.names, own, fit.change, inflation)
 
 
 def reasons_to_withdraw(
     problem: Problem, fit: CauseFit, probes: Mapping[tuple[str, str], ProbeResult]
 ) -> dict[str, str]:
-    """Return, by name, why significant causes are withdrawn; empty where all of them may be named."""
+    """Return, by name, why significant causes are withdrawn; empty where all of them may be named.
+
+    Where the instruments are filtered more, values agree up to the larger variance of these (Hausman, Econometrica
+    1978); where such a value is smaller, the cause fits noise of the wheel speeds, which goes with it.
+    """
     significant = [cause for cause in fit.causes if fit.tests[cause.name].significant]
-    slow = _slow_values(problem, fit) if significant else fit.change
+    if not significant:
+        return {}
+    cutoff_hz = SLOW_CUTOFF_RATIO * problem.low_pass.instrument_cutoff_hz
+    slower = problem._replace(low_pass=problem.low_pass._replace(instrument_cutoff_hz=cutoff_hz))
+    point, about = move_point(fit.info.vector, fit.names, fit.change), (fit.info.noise, fit.info.scatter)
+    info = slower.at(point, fit.names, noise=about[0], scatter=about[1]).counted_from(fit.info.vector)
+    slow, slow_cov = info.fit(fit.names)
     reasons = {}
     for cause in significant:
-        constant = constancy_of_cause(fit, cause)
+        constant, at = constancy_of_cause(fit, cause), fit.at(cause)
+        size, var = fit.change[at], np.maximum(np.diag(slow_cov - fit.cov)[at], 0.0)
+        least = SLOW_Z * np.sqrt(var * fit.tests[cause.name].inflation), SLOW_RATIO * np.linalg.norm(size)
         reason = (
             _at_bound(problem, fit, cause)
             or (constant.caveat if constant.varies else "")
             or _probed(fit, cause, probes)
             or _worse(fit, cause)
-            or _frequency_dependent(fit, cause, slow)
         )
+        if not reason and ((size - slow[at]) * np.sign(size) > np.maximum(*least)).any():
+            reason = "has a smaller value in slow motion: it fits noise of the wheel speeds"
         if reason:
             reasons[cause.name] = f"it reduces the residual, but {reason}"
     return reasons
@@ -341,7 +323,7 @@ def _at_bound(problem: Problem, fit: CauseFit, cause: Effect) -> str:
     for p in cause.parameters:
         low, high = BOUNDS[p.name]
         value = problem.simulation.effects.get(p.name, 0.0) + float(fit.change[fit.names.index(p.name)])
-        above, below = (NEAR_BOUND * min(high - low, 2.0 * abs(bound)) for bound in (high, low))
+        above, below = [NEAR_BOUND * min(high - low, 2.0 * abs(bound)) for bound in (high, low)]
         if value > high - above or (low < 0.0 and value < low + below):
             return f"{p.label} ends at the bound of what it may be ({value:.3g} {p.unit})"
     return ""
@@ -349,35 +331,28 @@ def _at_bound(problem: Problem, fit: CauseFit, cause: Effect) -> str:
 
 def _probed(fit: CauseFit, cause: Effect, probes: Mapping[tuple[str, str], ProbeResult]) -> str:
     """Return the input that explains much of the cause's main channels beside it."""
-    main, own = shown_channels(fit, cause), [p.name for p in cause.parameters]
-    beside = {
-        at: probe
-        for at, probe in probes.items()
-        if at[0] in main
-        and probe.significant
-        and max((probe.alike[name] for name in own if name in probe.alike), default=1.0) > PROBE_ALIKE
-    }
-    most = max(beside, key=lambda at: beside[at].gain, default=None)
-    if most is None or beside[most].gain <= PROBE_RATIO * raw_gain(fit, cause):
-        return ""
-    return f"{most[0]} depends on {most[1]} beside it (z {beside[most].z:.1f})"
+    most, gain, main = "", PROBE_RATIO * raw_gain(fit, cause), shown_channels(fit, cause)
+    for (channel, name), probe in probes.items():
+        alike = [probe.alike[p.name] for p in cause.parameters if p.name in probe.alike]
+        beside = channel in main and probe.significant and max(alike, default=1.0) > PROBE_ALIKE
+        if beside and probe.gain > gain:
+            most, gain = f"{channel} depends on {name} beside it (z {probe.z:.1f})", probe.gain
+    return most
 
 
 def _worse(fit: CauseFit, cause: Effect) -> str:
     """Return the channel that a cause makes worse, or its main channel if it gains nothing held out."""
-    effect = channel_effects(fit, cause)
-    for name, channel in effect.items():
-        if channel.with_cause > WORSE_RATIO * channel.without:
-            more = channel.with_cause / channel.without - 1.0
-            return f"it makes {name} worse, by {more:.0%} of the square"
-    main = shown_channels(fit, cause)[0]
-    if not effect[main].held_out_gain > 0:
+    effects, main = channel_effects(fit, cause), shown_channels(fit, cause)[0]
+    for name, (without, with_cause, _) in effects.items():
+        if with_cause > WORSE_RATIO * without:
+            return f"it makes {name} worse, by {with_cause / without - 1.0:.0%} of the square"
+    if not effects[main][2] > 0:
         return f"it gains nothing in {main}, its main channel, on runs left out"
     return ""
 
 
-def channel_effects(fit: CauseFit, cause: Effect) -> dict[str, ChannelEffect]:
-    """Return what a cause does to each channel that was measured.
+def channel_effects(fit: CauseFit, cause: Effect) -> dict[str, tuple[float, float, float]]:
+    """Return what a cause does to each channel: whitened squares without and with it, and the held-out gain.
 
     What varies from run to run is taken out of each run as its residual shows it, but not the cause's own
     variation, which would take its place.  What that variation costs by its assumed size counts in the
@@ -388,8 +363,8 @@ def channel_effects(fit: CauseFit, cause: Effect) -> dict[str, ChannelEffect]:
     free, precision = info.nuisances[beside], np.diag(1.0 / info.nuisance_std[beside] ** 2)
     squares = np.zeros((2, 2, len(CHANNELS)))  # without and with the cause, by all runs and by the others
     for m, places in enumerate((base, info.places(fit.names))):
-        common = fit_change(info, [info.names[i] for i in places])[0]
-        held_out = fits_without_each(info, places)
+        common = info.fit([info.names[i] for i in places])[0]
+        held_out = info.fits_without_each(places)
         for i, white in enumerate(info.white):
             random = white[free]
             flat = random.reshape(free.size, white[-1].size)
@@ -397,131 +372,93 @@ def channel_effects(fit: CauseFit, cause: Effect) -> dict[str, ChannelEffect]:
             shown = (random**2).sum(axis=1)
             cost = precision @ (shown / np.maximum(shown.sum(axis=1, keepdims=True), 1e-30))
             for kind, x in enumerate((common, held_out[i])):
-                fitted = -info.away
-                fitted[places] += x
-                left = white[-1] - np.tensordot(fitted, white[:-1], axes=1)
+                left = white[-1] - np.tensordot(x, white[places], axes=1)
                 deviation = inner @ (flat @ left.ravel())
                 left -= np.tensordot(deviation, random, axes=1)
                 squares[m, kind] += (left**2).sum(axis=0) + deviation**2 @ cost
-    return {
-        CHANNELS[c]: ChannelEffect(squares[0, 0, c], squares[1, 0, c], squares[0, 1, c] - squares[1, 1, c])
-        for c in range(len(CHANNELS))
-        if squares[1, 0, c] > 0
-    }
-
-
-def _slow_values(problem: Problem, fit: CauseFit) -> Array:
-    """Return values and variances (k, 2) where the instruments are filtered more."""
-    cutoff_hz = SLOW_CUTOFF_RATIO * problem.low_pass.instrument_cutoff_hz
-    slower = problem._replace(low_pass=problem.low_pass._replace(instrument_cutoff_hz=cutoff_hz))
-    info = slower.at(move_point(fit.info.vector, fit.names, fit.change), fit.names, fit.info.statistics)
-    value, cov = fit_change(replace(info, vector=problem.simulation.vector), fit.names)
-    return np.column_stack([value, np.diag(cov)])
-
-
-def _frequency_dependent(fit: CauseFit, cause: Effect, slow: Array) -> str:
-    """Return whether a cause is smaller when quick motion is filtered out of the instruments.
-
-    Both estimate the same quantity, so they agree up to the larger variance of the slower one (Hausman,
-    Econometrica 1978); where the slower one is smaller, the cause fits noise of the wheel speeds, which goes
-    with it.
-    """
-    at = [fit.names.index(p.name) for p in cause.parameters]
-    size = fit.change[at]
-    var = np.maximum(slow[at, 1] - np.diag(fit.cov)[at], 0.0) * fit.tests[cause.name].inflation
-    apart = (size - slow[at, 0]) * np.sign(size)
-    if (apart > np.maximum(SLOW_Z * np.sqrt(var), SLOW_RATIO * np.linalg.norm(size))).any():
-        return "has a smaller value in slow motion: it fits noise of the wheel speeds"
-    return ""
+    (without, without_held), (with_cause, with_held) = squares
+    of_channels = zip(CHANNELS, without, with_cause, without_held - with_held, strict=True)
+    return {name: (a, b, gain) for name, a, b, gain in of_channels if b > 0}
 
 
 # -- What is done to runs before causes are searched: faults repaired, lags known, unfit runs excluded -----
 
 REST_MPS = 0.02  #: Fastest that a wheel turns, by its sensor's noise, in a run that does not drive
 
-
-class Prepared(NamedTuple):
-    """Runs that are fit to be compared."""
-
-    problem: Problem  #: of these runs, faults repaired
-    faults: tuple[Fault, ...]  #: that were found and repaired, in all runs that were given
-    excluded: tuple[Excluded, ...]  #: runs that are unfit
-    seeds: Mapping[str, float]
-    """Lags of sensors, by parameter, so large that a search has to start from them."""
-    aligned: Evidence  #: of the runs with these lags built in
-    shift: Shift  #: clocks of the runs behind that
+Prepared = tuple[Problem, tuple[Fault, ...], tuple[Excluded, ...], dict[str, float], Evidence, Shift]
 
 
 def prepare(signals: Sequence[Signals], simulation: Simulation, library: Sequence[Effect]) -> Prepared:
-    """Return runs without faults, without unfit ones, and the lags of their sensors.
+    """Return the problem of the runs that are fit to be compared, and what was found out about all of them.
+
+    Returns
+    -------
+    problem : of the fit runs, faults repaired
+    faults : that were found and repaired, in all runs that were given
+    excluded : runs that are unfit
+    seeds : lags of sensors, by parameter, so large that a search has to start from them
+    aligned : evidence of the runs with these lags built in
+    shift : clocks of the runs behind that
 
     Raises
     ------
     DataError
         if too few runs are fit, or their clocks are further apart than is searched.
     """
-    low_pass = low_pass_of(signals)
+    low_pass, known = low_pass_of(signals), names_of(library)
     plain = [
         rows_of(run, simulation.planar_on(run.terrain), simulation.vector, (), low_pass) for run in signals
     ]
     latencies = latencies_of(signals, simulation)
     faults = faults_of(signals, plain, simulation, low_pass, latencies)
-    runs = repaired(signals, faults)
+    runs, checked = repaired(signals, faults), False
+    excluded: tuple[Excluded, ...] = ()
     if faults:
         latencies = latencies_of(runs, simulation)
-    problem = Problem(runs, simulation, low_pass, tuple(library))
-    seeds, aligned, shift = _aligned(problem, latencies)
-    excluded = unfit_runs(runs, aligned, shift)
-    if excluded:
-        unfit = {run.run_id for run in excluded}
-        fit = tuple(run for run in runs if run.run_id not in unfit)
-        if len(fit) < MIN_RUNS:
-            reasons = "; ".join(f"{run.run_id}: {run.reason}" for run in excluded[:3])
-            raise DataError(f"runs: only {len(fit)} of {len(signals)} are fit to be compared ({reasons})")
-        problem = problem._replace(signals=fit)
-        seeds, aligned, shift = _aligned(problem, latencies_of(fit, simulation))
-    if not any(np.nanmax(np.abs(run.wheel_speed_mps), initial=0.0) > REST_MPS for run in problem.signals):
-        n = len(problem.signals)
-        raise DataError(f"runs: in all {n} the wheels are at rest; runs that drive are required")
-    return Prepared(problem, faults, excluded, seeds, aligned, shift)
+    while True:
+        problem = Problem(runs, simulation, low_pass, tuple(library))
+        seeds = {name: value for name, value in latencies.starting_values.items() if name in known}
+        aligned = problem.at(move_point(simulation.vector, [*seeds], [*seeds.values()]))
+        shift = shifts_of(aligned)
+        if checked or not (excluded := unfit_runs(runs, aligned, shift)):
+            break
+        unfit, checked = {run.run_id for run in excluded}, True
+        runs = tuple([run for run in runs if run.run_id not in unfit])
+        if len(runs) < MIN_RUNS:
+            reasons = "; ".join([f"{run.run_id}: {run.reason}" for run in excluded[:3]])
+            raise DataError(f"runs: only {len(runs)} of {len(signals)} are fit to be compared ({reasons})")
+        latencies = latencies_of(runs, simulation)
+    if not any(np.nanmax(np.abs(run.wheel_speed_mps), initial=0.0) > REST_MPS for run in runs):
+        raise DataError(f"runs: in all {len(runs)} the wheels are at rest; runs that drive are required")
+    return problem, faults, excluded, seeds, aligned, shift
 
 
-def _aligned(problem: Problem, latencies: Latencies) -> tuple[dict[str, float], Evidence, Shift]:
-    """Return lags to start from, the information of the runs with them built in, and their clocks there."""
-    known = names_of(problem.library)
-    seeds = {name: value for name, value in latencies.starting_values.items() if name in known}
-    aligned = problem.at(move_point(problem.simulation.vector, tuple(seeds), np.array(list(seeds.values()))))
-    return seeds, aligned, shifts_of(aligned)
+# -- What a diagnosis states of what was found ---------------------------------------------------------------
 
 
-# -- What a diagnosis states of what was found: causes, rivals, limits, what is ruled out, and residuals ---
-
-
-def values_of(fit: CauseFit, effect: Effect) -> tuple[Value, ...]:
+def values_of(fit: CauseFit, effect: Effect) -> tuple[verdict.Value, ...]:
     """Return the fitted values of a cause."""
-    at = [fit.names.index(p.name) for p in effect.parameters]
+    at = fit.at(effect)
     return _values(effect, fit.change[at], np.sqrt(fit.cov[at, at] * fit.tests[effect.name].inflation))
 
 
-def _values(effect: Effect, change: Array, std: Array) -> tuple[Value, ...]:
-    half = INTERVAL_T * std
-    return tuple(
-        Value(p.name, float(x), p.unit, float(x - h), float(x + h))
-        for p, x, h in zip(effect.parameters, change, half, strict=True)
-    )
+def _values(effect: Effect, change: Array, std: Array) -> tuple[verdict.Value, ...]:
+    numbers = zip(effect.parameters, change.tolist(), (verdict.INTERVAL_T * std).tolist(), strict=True)
+    return tuple([verdict.Value(p.name, x, p.unit, x - half, x + half) for p, x, half in numbers])
 
 
-def cause_of(fit: CauseFit, effect: Effect) -> Cause:
+def cause_of(problem: Problem, fit: CauseFit, effect: Effect) -> verdict.Cause:
     """Return what is stated of a cause that is named."""
     test, size = fit.tests[effect.name], float(fit.info.c.sum())
-    low, high = gain_interval(test.gain)
-    constant, parameter = constancy_of_cause(fit, effect), effect.parameters[0]
-    caveats = [constant.caveat] if constant.caveat else []
-    scatter, value = run_scatter(fit, parameter.name), fit.change[fit.names.index(parameter.name)]
-    if len(effect.parameters) == 1 and scatter > CAVEAT_RATIO * abs(float(value)):
+    low, high = test.gain_interval
+    caveat, parameter = constancy_of_cause(fit, effect).caveat, effect.parameters[0]
+    caveats = [caveat] if caveat else []
+    scatter = constancy.run_scatter(problem, fit, parameter.name)
+    value = float(fit.change[fit.names.index(parameter.name)])
+    if len(effect.parameters) == 1 and scatter > constancy.CAVEAT_RATIO * abs(value):
         unit = UNITS.get(parameter.unit, parameter.unit)
         caveats.append(f"it differs from run to run by {scatter:.2g} {unit}".strip())
-    return Cause(
+    return verdict.Cause(
         name=effect.name,
         aliases=effect.aliases,
         parameters=values_of(fit, effect),
@@ -534,58 +471,7 @@ def cause_of(fit: CauseFit, effect: Effect) -> Cause:
     )
 
 
-def rival_values(fit: CauseFit, sets: Sequence[tuple[str, ...]]) -> dict[str, tuple[Value, ...]]:
-    """Return the values that every member of an ambiguous set would have."""
-    values = {cause.name: values_of(fit, cause) for cause in fit.causes}
-    for rivals in fit.rivals.values():
-        for rival in rivals:
-            values.setdefault(rival.effect.name, _values(rival.effect, rival.change, rival.std))
-    return {name: values[name] for names in sets for name in names}
-
-
-def limits_of(fit: CauseFit, library: Sequence[Effect]) -> tuple[Limit, ...]:
-    """Return the detection limit of every effect beside what was found."""
-    a, limits = fit.info.a.sum(axis=0), []
-    for effect in library:
-        base = fit.info.places([name for name in fit.names if name not in names_of([effect])])
-        for parameter in effect.parameters:
-            own = fit.info.places([parameter.name])
-            free = float(partial_information(a, base, own)[1][0, 0])
-            known = free > 1e-9 * max(a[own[0], own[0]], 1e-12)
-            value = (Z_EFFECT + POWER_Z) / float(np.sqrt(free)) if known else np.inf
-            limits.append(Limit(parameter.name, value, parameter.unit, effect.needs))
-    return tuple(limits)
-
-
-def ruled_out_of(
-    fit: CauseFit,
-    named: Sequence[Effect],
-    sets: Sequence[tuple[str, ...]],
-    withdrawn: Mapping[str, RuledOut],
-    library: Sequence[Effect],
-) -> tuple[RuledOut, ...]:
-    """Return the effects that are not the answer, those that were withdrawn first."""
-    answered = {effect.name for effect in named} | {name for names in sets for name in names} | {*withdrawn}
-    out = list(withdrawn.values())
-    for effect in library:
-        if effect.name in answered:
-            continue
-        test = fit.tests[effect.name]
-        values: tuple[Value, ...] = ()
-        if effect in fit.causes:
-            reason = "it is not significant beside the other causes"
-            values = values_of(fit, effect)
-        elif not test.inside:
-            reason = "the fitted value is out of its bounds"
-        elif test.z <= Z_EFFECT:
-            reason = "it is not significant beside what was found"
-        else:
-            reason = "it does not reduce the residual of runs left out, or differs from run to run"
-        out.append(RuledOut(effect.name, reason, test.z, values))
-    return tuple(out)
-
-
-def residuals_of(info: Evidence, start: Evidence) -> dict[str, Residual]:
+def residuals_of(info: Evidence, start: Evidence) -> dict[str, verdict.Residual]:
     """Return how far measured and simulated are apart, by channel."""
     out = {}
     for channel in measured_channels(info.rows):
@@ -593,5 +479,5 @@ def residuals_of(info: Evidence, start: Evidence) -> dict[str, Residual]:
         rms = float(np.sqrt(np.nanmean(np.concatenate([run.residual[:, c] for run in info.rows]) ** 2)))
         noise = float(start.noise.std[c])
         systematic = max(1.0 - (noise / rms) ** 2, 0.0) if rms > 0 else 0.0
-        out[channel] = Residual(rms, noise, systematic)
+        out[channel] = verdict.Residual(rms, noise, systematic)
     return out

@@ -13,16 +13,20 @@ where a fit has moved far.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import chi2, norm
+from scipy.stats import t as student
 
+from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.discrepancy.noise import ORDER, ORDERS, WHITE, Noise, noise_of, whiten
 from terrain.discrepancy.runs import LowPass, Rows, Signals, Simulation, rows_of
-from terrain.effects import BOUNDS, CHANNELS, INDEX
+from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect
 from terrain.records import Array
 
 N_BLOCKS = 3  #: Time blocks of a run; they serve as clusters where runs are few
@@ -32,13 +36,6 @@ PRIOR_STD = {name: 0.5 * max(abs(low), high) for name, (low, high) in BOUNDS.ite
 """Prior of a parameter while the whole library is freed to estimate the noise."""
 
 UNKNOWN_STD = 1e-6  #: Prior of one that is not in the library: it stays where it is
-
-
-class Statistics(NamedTuple):
-    """What differs at random: noise of each channel, and standard deviation from run to run by parameter."""
-
-    noise: Noise
-    scatter: Mapping[str, float]
 
 
 def marginal(grams: Array, random: Sequence[int] | Array, std: Array) -> tuple[Array, Array, Array]:
@@ -76,10 +73,9 @@ class Evidence:
     vector: Array  #: (len(PARAMETERS),) the point from which changes are counted
     origin: Array  #: the point where sensitivities were taken, whatever changes are counted from
     grams: Array
-    """(runs, N_BLOCKS, k + 1, k + 1) products of whitened sensitivities and, last, of the residual at ``origin``,
-    in each third of each run; nothing is marginalised."""
-    nuisances: Array  #: (q,) places in ``names`` of what varies from run to run
-    nuisance_std: Array  #: (q,) by how much
+    """(runs, N_BLOCKS, k + 1, k + 1) products of whitened sensitivities and, last, of the residual, in each third
+    of each run; nothing is marginalised."""
+    scatter: Mapping[str, float]  #: standard deviation of what varies from run to run, by parameter
     rows: tuple[Rows, ...]  #: from which they come
     noise: Noise
     white: tuple[Array, ...]  #: of each run (k + 1, rows, channels) the columns, 0 where nothing was measured
@@ -89,21 +85,19 @@ class Evidence:
         """Return the positions of parameters in the matrices."""
         return [self.names.index(name) for name in names]
 
-    @property
-    def statistics(self) -> Statistics:
-        """Noise and scatter that were estimated or given."""
-        names = [self.names[i] for i in self.nuisances]
-        return Statistics(self.noise, dict(zip(names, self.nuisance_std.tolist(), strict=True)))
+    @cached_property
+    def nuisances(self) -> Array:
+        """Places (q,) in ``names`` of what varies from run to run."""
+        return np.array(self.places([*self.scatter]), dtype=int)
 
     @cached_property
-    def away(self) -> Array:
-        """Where sensitivities were taken, over the point from which changes are counted (k,)."""
-        at = [INDEX[name] for name in self.names]
-        return self.origin[at] - self.vector[at]
+    def nuisance_std(self) -> Array:
+        """Standard deviations (q,) of these."""
+        return np.array([*self.scatter.values()])
 
     @cached_property
     def marginal(self) -> tuple[Array, Array, Array]:
-        """Products around the origin with what varies integrated out, its shift and covariance: :func:`marginal`."""
+        """Products with what varies integrated out, its shift and covariance: :func:`marginal`."""
         return marginal(self.grams, self.nuisances, self.nuisance_std)
 
     @property
@@ -111,67 +105,93 @@ class Evidence:
         """``A`` of each run (runs, k, k)."""
         return self.marginal[0][:, :-1, :-1]
 
-    @cached_property
+    @property
     def g(self) -> Array:
         """``g`` of each run (runs, k)."""
-        return np.asarray(self.marginal[0][:, :-1, -1] + self.a @ self.away)
-
-    @cached_property
-    def c(self) -> Array:
-        """``c`` of each run (runs,)."""
-        last = self.marginal[0][:, :, -1]
-        return np.asarray(last[:, -1] + 2.0 * last[:, :-1] @ self.away + self.away @ self.a @ self.away)
+        return self.marginal[0][:, :-1, -1]
 
     @property
-    def origin_loss(self) -> float:
-        """Sum of ``c`` at the origin."""
-        return float(self.marginal[0][:, -1, -1].sum())
+    def c(self) -> Array:
+        """``c`` of each run (runs,)."""
+        return self.marginal[0][:, -1, -1]
 
-    @cached_property
-    def blocks(self) -> tuple[Array, Array]:
-        """``A`` and ``g`` of each third of each run, (runs, N_BLOCKS, k, k) and (runs, N_BLOCKS, k)."""
-        parts = marginal_parts(self.grams, self.nuisances, self.nuisance_std)
-        a = parts[:, :, :-1, :-1]
-        return a, np.asarray(parts[:, :, :-1, -1] + a @ self.away)
+    @property
+    def away(self) -> Array:
+        """Where sensitivities were taken, over the point from which changes are counted (k,)."""
+        return (self.origin - self.vector)[[INDEX[name] for name in self.names]]
+
+    def residuals(self, change: Array) -> list[Array]:
+        """Return the whitened residual (rows, channels) of each run at a change (k,), linearly."""
+        return [white[-1] - np.tensordot(change, white[:-1], axes=1) for white in self.white]
+
+    def counted_from(self, vector: Array) -> Evidence:
+        """Return the same with changes counted from another point."""
+        apart = (self.vector - vector)[[INDEX[name] for name in self.names]]
+        columns = np.eye(len(apart) + 1)
+        columns[:-1, -1] = apart
+        left = self.residuals(-apart)
+        white = [np.concatenate([run[:-1], r[None]]) for run, r in zip(self.white, left, strict=True)]
+        return replace(self, vector=vector, grams=columns.T @ self.grams @ columns, white=tuple(white))
 
     def clusters(self, at: Sequence[int], by_run: bool = True) -> tuple[Array, Array]:
         """Return ``A`` (clusters, n, n) and ``g`` (clusters, n) of some places, a cluster a run or a third of one."""
-        a, g = (self.a, self.g) if by_run else (x.reshape(-1, *x.shape[2:]) for x in self.blocks)
-        return a[:, at][:, :, at], g[:, at]
+        parts = self.marginal[0]
+        if not by_run:
+            parts = marginal_parts(self.grams, self.nuisances, self.nuisance_std)
+            parts = parts.reshape(-1, *parts.shape[2:])
+        return parts[:, at][:, :, at], parts[:, at, -1]
 
     def total(self, names: Sequence[str]) -> tuple[Array, Array]:
         """Return ``A`` (n, n) and ``g`` (n,) of some parameters, all runs together."""
         a, g = self.clusters(self.places(names))
         return a.sum(axis=0), g.sum(axis=0)
 
-    def fit(self, own: Sequence[str], others: Sequence[str], where: Array) -> tuple[Array, Array]:
+    def fit(self, names: Sequence[str]) -> tuple[Array, Array]:
+        """Return the change (n,) of parameters that fits all runs best, and its covariance by the noise."""
+        a, g = self.total(names)
+        cov = np.linalg.pinv(a, hermitian=True)
+        return cov @ g, cov
+
+    def loss(self, names: Sequence[str]) -> float:
+        """Return minus twice the log-likelihood of the best fit of parameters, up to what no fit changes."""
+        a, g = self.total(names)
+        return -float(g @ np.linalg.lstsq(a, g, rcond=1e-10)[0]) if len(names) else 0.0
+
+    def fit_groups(self, own: Sequence[str], others: Sequence[str], where: Array) -> tuple[Array, Array]:
         """Fit parameters in each group of the data, others in common, what varies from run to run marginalised.
 
         ``where`` (runs, N_BLOCKS) is the group of each third of each run.  Returned are values (groups, p), NaN
         where a group shows nothing, and their covariance (groups, p, groups, p) by the noise.
         """
         n_groups, p, q = int(where.max()) + 1, len(own), self.nuisances.size
-        k = n_groups * p + len(others)
-        design = np.zeros((*where.shape, len(self.names) + 1, q + k + 1))
+        m = n_groups * p
+        design = np.zeros((*where.shape, len(self.names) + 1, q + m + len(others) + 1))
         design[:, :, self.nuisances, np.arange(q)] = 1.0
-        design[:, :, self.places(others), np.arange(q + n_groups * p, q + k)] = 1.0
-        design[:, :, :, -1] = *self.away, 1.0
+        design[:, :, self.places(others), np.arange(q + m, q + m + len(others))] = 1.0
+        design[:, :, -1, -1] = 1.0
         for (i, b), group in np.ndenumerate(where):
             design[i, b, self.places(own), np.arange(q + group * p, q + (group + 1) * p)] = 1.0
         columns = design.transpose(0, 1, 3, 2) @ self.grams @ design
         free = marginal(columns, np.arange(q), self.nuisance_std)[0][:, q:, q:].sum(axis=0)
-        total, m = free[:-1, :-1], n_groups * p
-        cov = np.linalg.pinv(total, hermitian=True, rcond=1e-12)
-        shown = np.diag(total)[:m] > 1e-9 * np.diag(total)[:m].max()
+        cov = np.linalg.pinv(free[:-1, :-1], hermitian=True, rcond=1e-12)
+        shown = np.diag(free)[:m] > 1e-9 * np.diag(free)[:m].max()
         values = np.where(shown, (cov @ free[:-1, -1])[:m], np.nan).reshape(n_groups, p)
         return values, cov[:m, :m].reshape(n_groups, p, n_groups, p)
+
+    def fits_without_each(self, at: Sequence[int]) -> Array:
+        """Return the change (runs, n) of parameters at some places that fits all runs but each of them."""
+        a, g = self.clusters(at)
+        # in standard deviations of each parameter; one without information in the other runs keeps its value
+        unit = np.sqrt(np.maximum(np.einsum("kii->i", a), 1e-30))
+        rest = (a.sum(axis=0) - a) / np.outer(unit, unit) + 1e-9 * np.eye(len(at))
+        return np.asarray(np.linalg.solve(rest, ((g.sum(axis=0) - g) / unit)[:, :, None])[:, :, 0] / unit)
 
     def channel_power(self, weights: Array) -> Array:
         """Return the square (channels,) over all runs of combinations (p, k) of the sensitivities."""
         changes = (np.tensordot(weights, white[:-1], axes=1) for white in self.white)
         return np.asarray(sum((change**2).sum(axis=(0, 1)) for change in changes))
 
-    @property
+    @cached_property
     def freed(self) -> Array:
         """The information (k, k) of all runs with every parameter freed up to its prior."""
         return np.asarray(self.a.sum(axis=0) + self.prior)
@@ -188,21 +208,19 @@ def evidence_at(
     vector: Array,
     parameters: Sequence[str],
     low_pass: LowPass,
-    statistics: Statistics | None = None,
-    own: Mapping[str, Array] | None = None,
+    noise: Noise | None = None,
     scatter: Mapping[str, float] | None = None,
+    own: Mapping[str, Array] | None = None,
 ) -> Evidence:
-    """Return the evidence of runs around a point; noise and scatter are estimated unless given.
+    """Return the evidence of runs around a point; noise and scatter are estimated unless the noise is given.
 
-    What is assumed of the scatter is that of the simulation by default.  With ``own`` values (runs,) of some
-    of the parameters, sensitivities are those of each run at its own; residuals are counted from the point
-    all the same, linearly.
+    The scatter is then what is assumed of it, that of the simulation by default.  With ``own`` values (runs,)
+    of some of the parameters, sensitivities are those of each run at its own; residuals are counted from the
+    point all the same, linearly.
     """
     planar = {terrain: simulation.planar_on(terrain) for terrain in {run.terrain for run in signals}}
-    assumed = simulation.scatter if scatter is None else scatter
-    scattered = [name for name in assumed if assumed[name] > 0]
-    names = tuple(dict.fromkeys([*parameters, *scattered]))
-    own = own or {}
+    assumed = {n: std for n, std in (simulation.scatter if scatter is None else scatter).items() if std > 0}
+    names, own = tuple(dict.fromkeys([*parameters, *assumed])), own or {}
     at, columns = [INDEX[name] for name in own], [names.index(name) for name in own]
     rows = []
     for i, run in enumerate(signals):
@@ -212,32 +230,41 @@ def evidence_at(
         back = np.tensordot(vector[at] - there[at], run_rows.sensitivity[columns], axes=1)
         rows.append(run_rows._replace(predicted=run_rows.predicted + back))
     model_std = np.array([simulation.model_error.get(name, 0.0) for name in names])
-    nuisances = np.array([names.index(name) for name in scattered], dtype=int)
 
-    def whitened(noise: Noise, std: Array) -> Evidence:
-        white = tuple(whiten_run(noise, run) for run in rows)
+    def whitened(noise: Noise, scatter: Mapping[str, float]) -> Evidence:
+        white = tuple([whiten_run(noise, run) for run in rows])
         grams = np.array([grams_of(columns) for columns in white])
-        about = nuisances, std, tuple(rows), noise, white, model_std
-        return Evidence(names, vector, vector, grams, *about)
+        return Evidence(names, vector, vector, grams, scatter, tuple(rows), noise, white, model_std)
 
-    if statistics is not None:
-        return whitened(statistics.noise, np.array([statistics.scatter[name] for name in scattered]))
+    if noise is not None:
+        return whitened(noise, assumed)
     # by what the whole library and a few probes leave; the first fits weigh all frequencies alike: see WHITE
     speeds, row_s = [run.pace_mps for run in rows], float(np.median(np.diff(rows[0].time_s)))
-    std = assumed_std = np.array([assumed[name] for name in scattered])
-    noise = noise_of([run.residual for run in rows], speeds, row_s, orders=WHITE)
+    noise, varies = noise_of([run.residual for run in rows], speeds, row_s, orders=WHITE), assumed
     for orders in (WHITE, ORDERS, ORDERS):
-        loose = whitened(noise, std)
-        if std.size:
+        loose = whitened(noise, varies)
+        if varies:
             # about what the whole library explains of all runs alike
             x = np.linalg.solve(loose.freed, loose.g.sum(axis=0))
-            along = loose.grams.sum(axis=1)[:, nuisances]
-            std = scatter_of(along[:, :, nuisances], along[:, :, -1] - along[:, :, :-1] @ x, assumed_std)
-            loose = replace(loose, nuisance_std=std)
-        left, n_fitted = _library_residuals(loose)
+            along = loose.grams.sum(axis=1)[:, loose.nuisances]
+            score = along[:, :, -1] - along[:, :, :-1] @ x
+            std = scatter_of(along[:, :, loose.nuisances], score, np.array([*assumed.values()]))
+            varies = dict(zip(assumed, std.tolist(), strict=True))
+            loose = replace(loose, scatter=varies)
+        _, shift, inner = loose.marginal
+        x = np.linalg.solve(loose.freed, loose.g.sum(axis=0))
+        changes = np.tile(x, (len(rows), 1))
+        changes[:, loose.nuisances] += shift[:, :, -1] - shift[:, :, :-1] @ x
+        left = [
+            r.residual - np.tensordot(z, r.sensitivity, axes=1) for r, z in zip(rows, changes, strict=True)
+        ]
+        # how many parameters were fitted to these residuals
+        shown = shift.shape[0] * shift.shape[1] - (np.einsum("iqq->iq", inner) / loose.nuisance_std**2).sum()
+        n_fitted = float(np.trace(np.linalg.solve(loose.freed, loose.a.sum(axis=0)))) + float(shown)
         noise = noise_of(left, speeds, row_s, n_fitted, orders)
-    plain = noise_of(_without_probes(loose, left), speeds, row_s, n_fitted + len(CHANNELS) * N_PROBES, ORDERS)
-    return whitened(noise._replace(std=plain.std), std)
+    _take_out_probes(rows, loose.noise, left)
+    plain = noise_of(left, speeds, row_s, n_fitted + len(CHANNELS) * N_PROBES, ORDERS)
+    return whitened(noise._replace(std=plain.std), varies)
 
 
 def grams_of(columns: Array) -> Array:
@@ -262,53 +289,22 @@ def whiten_run(noise: Noise, run: Rows) -> Array:
     return np.asarray(whiten(noise.filters, both) * valid)
 
 
-def _library_residuals(info: Evidence) -> tuple[list[Array], float]:
-    """Return the residuals with the whole library and probes freed, and how many parameters were fitted."""
-    _, shifts, inner = info.marginal
-    x = np.linalg.solve(info.freed, info.g.sum(axis=0))
-    left = []
-    for run, shift in zip(info.rows, shifts, strict=True):
-        move = x.copy()
-        move[info.nuisances] += shift[:, -1] - shift[:, :-1] @ x
-        left.append(run.residual - np.tensordot(move, run.sensitivity, axes=1))
-    n_fitted = float(np.trace(np.linalg.solve(info.freed, info.a.sum(axis=0))))
-    unknown = float((np.einsum("iqq->iq", inner) / info.nuisance_std**2).sum())
-    return left, n_fitted + len(inner) * info.nuisances.size - unknown
-
-
-def _without_probes(info: Evidence, left: Sequence[Array]) -> list[Array]:
-    """Return residuals (rows, channels) without what a few probes explain in all runs alike.
+def _take_out_probes(rows: Sequence[Rows], noise: Noise, left: Sequence[Array]) -> None:
+    """Take off residuals (rows, channels), in place, what a few probes explain in all runs alike.
 
     A constant, the speed, the turn and their product: what the library does not have is no noise.
     """
-    probes = []
-    for run in info.rows:
-        speed, turn = run.inputs[:, 0], run.inputs[:, 1]
-        probes.append(np.column_stack([np.ones_like(speed), speed, turn, speed * turn]))
-    out = [residual.copy() for residual in left]
-    size = np.concatenate([info.noise.size(run.pace_mps) for run in info.rows])
+    drives = [run.inputs[:, :2].T for run in rows]
+    probes = [np.column_stack([np.ones_like(u), u, turn, u * turn]) for u, turn in drives]
+    size = np.concatenate([noise.size(run.pace_mps) for run in rows])
     every, value = np.concatenate(probes), np.concatenate(left)
     for c in range(value.shape[1]):
         known = np.isfinite(value[:, c] / size[:, c])
         if known.sum() > 10 * N_PROBES:
             weighted = every[known] / size[known, c : c + 1]
             fit = np.linalg.lstsq(weighted, value[known, c] / size[known, c], rcond=1e-10)[0]
-            for residual, columns in zip(out, probes, strict=True):
+            for residual, columns in zip(left, probes, strict=True):
                 residual[:, c] -= columns @ fit
-    return out
-
-
-def fit_change(info: Evidence, names: Sequence[str]) -> tuple[Array, Array]:
-    """Return the change (k,) of parameters that fits all runs best, and its covariance by the noise."""
-    a, g = info.total(names)
-    cov = np.linalg.pinv(a, hermitian=True)
-    return cov @ g, cov
-
-
-def loss_of(info: Evidence, names: Sequence[str]) -> float:
-    """Return minus twice the log-likelihood of the best fit of parameters, up to what no fit changes."""
-    a, g = info.total(names)
-    return -float(g @ np.linalg.lstsq(a, g, rcond=1e-10)[0]) if len(names) else 0.0
 
 
 def partial_information(a: Array, base: Sequence[int], own: Sequence[int]) -> tuple[Array, Array]:
@@ -336,7 +332,7 @@ def correlation(a: Array, one: Sequence[int], other: Sequence[int]) -> float:
     return min(float(np.linalg.norm(between, 2)), 1.0)
 
 
-def move_point(point: Array, names: Sequence[str], change: Array) -> Array:
+def move_point(point: Array, names: Sequence[str], change: Array | Sequence[float]) -> Array:
     """Return the point that lies a change of the parameters named away, within the bounds of the library."""
     vector = point.copy()
     for name, value in zip(names, change, strict=True):
@@ -344,6 +340,138 @@ def move_point(point: Array, names: Sequence[str], change: Array) -> Array:
         if name in BOUNDS:
             vector[INDEX[name]] = np.clip(vector[INDEX[name]], *BOUNDS[name])
     return vector
+
+
+# -- Evidence of an effect: its fit over its noise, and what it gains on runs left out, clustered by run ---
+
+Z_EFFECT = 4.0  #: Evidence an effect needs, as a standard normal number: 6e-5, times a library of 26
+EXCITED_RATIO = 0.1  #: An effect counts as not excited if its detection limit exceeds this ratio of its bound
+
+TRUST_DOF = 8.0
+"""Degrees of freedom of the noise found by whitening, beside those of the scatter between clusters."""
+
+MIN_CLUSTERS = 6  #: With fewer runs, their time blocks are the clusters
+
+N_BOOTSTRAP = 1000
+
+
+class WaldTest(NamedTuple):
+    """Evidence of an effect beside those selected.
+
+    It is the fit over its noise, whose variance is weighed from whitening and from the scatter between clusters,
+    as a t statistic.
+    """
+
+    change: Array  #: (p,) of its parameters, fitted together with the selected ones
+    z: float  #: the standard normal number of the same improbability
+    dispersion: float  #: scatter between clusters over that which the noise allows, as variances
+    gain: Array  #: (runs,) fall of minus twice the log-likelihood of each run when it is left out of the fit
+    inside: bool  #: whether the fitted values lie within their bounds
+
+    @property
+    def significant(self) -> bool:
+        """Whether the effect is within its bounds, above the threshold, and gains on runs left out."""
+        return self.inside and self.z > Z_EFFECT and self.gain_interval[0] > 0
+
+    @property
+    def gain_interval(self) -> tuple[float, float]:
+        """The 95 % interval of the summed gain, by bootstrap over runs."""
+        return percentile_interval(bootstrap_counts(len(self.gain), N_BOOTSTRAP, 0) @ self.gain)
+
+    @property
+    def inflation(self) -> float:
+        """By how much the variance of its values is larger than by the noise alone; 1 at the least."""
+        return max(self.dispersion, 1.0)
+
+
+def wald_test(info: Evidence, selected: Sequence[str], effect: Effect) -> WaldTest:
+    """Return the evidence of an effect beside the parameters selected.
+
+    The scatter between clusters (runs; time blocks where runs are few) gives one estimate of the variance, with as
+    many degrees of freedom as there are informative clusters; the noise gives 1 with :data:`TRUST_DOF`.  Both are
+    weighted by their degrees of freedom.
+    """
+    own = [p.name for p in effect.parameters]
+    base = info.places([name for name in selected if name not in own])
+    both, n = base + info.places(own), len(base)
+    a, g = info.clusters(both)
+    total, score = a.sum(axis=0), g.sum(axis=0)
+    if not np.diag(total)[n:].min() > 1e-12:
+        return WaldTest(np.zeros(len(own)), 0.0, 0.0, np.zeros(len(a)), False)
+    # direction in which the new ones change while the selected ones follow
+    follow, free = partial_information(total, range(n), range(n, len(both)))
+    own_score = score[n:] - follow.T @ score[:n]
+    if not np.linalg.eigvalsh(free)[0] > 1e-9 * np.diag(total)[n:].min():
+        free = free + 1e-9 * np.diag(np.diag(total)[n:])
+    change = np.linalg.solve(free, own_score)
+    values = zip(own, info.vector[[INDEX[name] for name in own]] + change, strict=True)
+    inside = all(BOUNDS[name][0] - 1e-9 <= value <= BOUNDS[name][1] for name, value in values)
+    dispersion, dof, size = 1.0, TRUST_DOF, float(change @ free @ change)
+    if size > 0:
+        x = np.concatenate([np.zeros(n), change])
+        if n:
+            x[:n] = np.linalg.lstsq(total[:n, :n], score[:n] - total[:n, n:] @ change, rcond=1e-10)[0]
+        parts = (a, g) if len(a) >= MIN_CLUSTERS else info.clusters(both, by_run=False)
+        dispersion, dof = clustered_variance(*parts, x, np.concatenate([-follow @ change, change]), size)
+        dispersion += float((((free @ change) * info.model_std[both[n:]]) ** 2).sum()) / size
+    root = math.sqrt(statistic := float(own_score @ change))
+    if len(own) > 1:  # as improbable with one degree of freedom
+        log_p = float(chi2.logsf(statistic, len(own)))
+        if math.isinf(log_p):  # it underflows; far out the density falls as the tail does
+            log_p = float(chi2.logpdf(statistic, len(own))) + math.log(2.0)
+        root = z_of(log_p)
+    z = z_of_t(root / math.sqrt(dispersion), dof)
+    return WaldTest(change, z, dispersion, held_out_gain(info, base, both), inside)
+
+
+def clustered_variance(a: Array, g: Array, x: Array, direction: Array, size: float) -> tuple[float, float]:
+    """Return the variance of a fit ``x`` (k,) along a direction over that from the noise, and its degrees of freedom.
+
+    ``size`` is the information along it, of all clusters (a, k, k) together.
+    """
+    fraction = np.clip(np.einsum("i,kij,j->k", direction, a, direction) / size, 0.0, 0.9)
+    return pooled_variance((g - a @ x) @ direction, fraction, size)
+
+
+def pooled_variance(part: Array, fraction: Array, size: float) -> tuple[float, float]:
+    """Return a variance over that from the noise, and its degrees of freedom.
+
+    Of each cluster there is what is left of its score at the fit (``part``) and its ``fraction`` of the
+    information; ``size`` is the information in all, which is the variance of the score by the noise.
+    """
+    m = len(part)
+    variance = float(((part / (1.0 - fraction)) ** 2).sum()) * (m - 1) / m / size
+    dof = max(min(1.0 / (float((fraction**2).sum()) + 1e-12), m) - 1.0, 1.0)
+    both = TRUST_DOF + dof * variance
+    # Satterthwaite: where clusters scatter far more than the noise allows, only their degrees count
+    return both / (TRUST_DOF + dof), both**2 / (TRUST_DOF + dof * variance**2)
+
+
+def z_of_t(t: float, dof: float) -> float:
+    """Return the normal number that is as improbable as a t statistic, both two-sided."""
+    return z_of(float(student.logsf(t, dof)) + math.log(2.0))
+
+
+def z_of(log_p: float) -> float:
+    """Return the normal number of a two-sided log probability.
+
+    Examples
+    --------
+    >>> round(z_of(math.log(0.05)), 2)
+    1.96
+    """
+    if log_p > -600.0:
+        return max(float(norm.isf(math.exp(log_p) / 2)), 0.0)
+    return math.sqrt(-2.0 * log_p)
+
+
+def held_out_gain(info: Evidence, base: list[int], both: list[int]) -> Array:
+    """Return the fall (runs,) of each run's loss when it is left out of the fit, of ``both`` over ``base``."""
+    losses = []
+    for at in (base, both):
+        x, (a, g) = info.fits_without_each(at), info.clusters(at)
+        losses.append(np.einsum("ki,kij,kj->k", x, a, x) - 2 * (x * g).sum(axis=1))
+    return np.asarray(losses[0] - losses[1])
 
 
 # -- Scatter from run to run of the parameters that vary by themselves, estimated from the runs -------------

@@ -13,11 +13,10 @@ import numpy as np
 from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.discrepancy.compared import ComparedRun
 from terrain.discrepancy.diagnose import MIN_RUNS
-from terrain.discrepancy.evidence import N_BLOCKS, Evidence, evidence_at
+from terrain.discrepancy.evidence import MIN_CLUSTERS, N_BLOCKS, Evidence, evidence_at
 from terrain.discrepancy.health import Excluded, Fault, unfit_runs
 from terrain.discrepancy.runs import LowPass, Signals, Simulation, low_pass_of, measured_channels, rows_of
 from terrain.discrepancy.search import names_of
-from terrain.discrepancy.selection import MIN_CLUSTERS
 from terrain.effects import CHANNELS
 from terrain.errors import DataError, TerrainError
 from terrain.estimation.estimate import Estimate, estimate_run, summarize
@@ -52,8 +51,6 @@ def split_runs(runs: Sequence[RunLog], hold_out: int | None, seed: int) -> tuple
         n = math.ceil(len(runs) / HOLD_OUT_EVERY) if len(runs) >= HOLD_OUT_FROM else 0
     elif n and len(runs) - n < MIN_RUNS:
         raise DataError(f"--hold-out is {n} of {len(runs)} runs; the diagnosis requires at least {MIN_RUNS}")
-    if not n:
-        return list(runs), []
     drawn = np.random.default_rng(seed).permutation(len(runs))
     order = sorted(drawn, key=lambda i: runs[i].terrains)
     held_out = {order[k * len(runs) // n] for k in range(n)}
@@ -87,6 +84,22 @@ def repair_held_out(
             run = right if math.isnan(fault.change.factor) else min(run, right, key=misfit)
         fixed.append(run)
     return tuple(fixed)
+
+
+def ratio_of_sums(part: Array, whole: Array, seed: int) -> tuple[float, tuple[float, float]]:
+    """Return what a part (n,) is of the whole (n,) over clusters, and its 95 % interval by bootstrap over these.
+
+    Examples
+    --------
+    >>> ratio_of_sums(np.array([2.0, 0.0]), np.array([2.0, 2.0]), 0)
+    (0.5, (0.0, 1.0))
+    """
+    weights = bootstrap_counts(len(part), N_BOOTSTRAP, seed)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios, ratio = (weights @ part) / (weights @ whole), float(part.sum() / whole.sum())
+    if not np.isfinite(ratios).any():
+        return math.nan, (math.nan, math.nan)
+    return ratio, percentile_interval(ratios)
 
 
 # -- What an extension gains: the part of the square that it removes, by bootstrap over clusters -----------
@@ -125,25 +138,24 @@ def gain_of_signals(
     remains with the whole library freed around the extension.
     """
     signals, excluded, after = fit_to_judge(extended, runs)
-    before = evidence_at(signals, simulation, simulation.vector, (), low_pass_of(signals), after.statistics)
-    by_run = len(signals) >= MIN_CLUSTERS
-    weights = bootstrap_counts(len(signals) * (1 if by_run else N_BLOCKS), N_BOOTSTRAP, seed)
+    given = simulation, simulation.vector, (), low_pass_of(signals), after.noise, after.scatter
+    infos, n_parts = (evidence_at(signals, *given), after), 1 if len(signals) >= MIN_CLUSTERS else N_BLOCKS
     channels = {}
     for name in measured_channels(after.rows):
         c, rms, squares = CHANNELS.index(name), [], []
-        for info in (before, after):
+        for info in infos:
             white = [np.where(run[-1, :, c] == 0.0, np.nan, run[-1, :, c]) for run in info.white]
             for residuals in ([run.residual[:, c] for run in info.rows], white):
-                parts = [part for values in residuals for part in _clusters(values, by_run)]
-                square = np.array([np.nansum(part**2) for part in parts])
-                known = sum(int(np.isfinite(part).sum()) for part in parts)
-                rms.append(float(np.sqrt(square.sum() / known)) if known else math.nan)
-                squares.append(square)
-        sizes = rms[0], rms[2], rms[1], rms[3]
-        channels[name] = ChannelGain(*sizes, *_reduction(squares[0], squares[2], weights))
-    of_all = _reduction(_costs(before, by_run), _costs(after, by_run), weights)
-    ids = tuple(run.run_id for run in signals)
-    return Gain(ids, excluded, "runs" if by_run else "thirds of runs", channels, *of_all)
+                parts = [part for values in residuals for part in np.array_split(values, n_parts)]
+                squares.append(np.array([np.nansum(part**2) for part in parts]))
+                known = int(np.isfinite(np.concatenate(residuals)).sum())
+                rms.append(float(np.sqrt(squares[-1].sum() / known)) if known else math.nan)
+        reduction, ci = ratio_of_sums(squares[0] - squares[2], squares[0], seed)
+        channels[name] = ChannelGain(rms[0], rms[2], rms[1], rms[3], reduction, ci, not ci[0] > 0.0)
+    costs = [_costs(info, n_parts) for info in infos]
+    reduction, ci = ratio_of_sums(costs[0] - costs[1], costs[0], seed)
+    ids, clusters = tuple([run.run_id for run in signals]), "runs" if n_parts == 1 else "thirds of runs"
+    return Gain(ids, excluded, clusters, channels, reduction, ci, not ci[0] > 0.0)
 
 
 def fit_to_judge(
@@ -159,19 +171,19 @@ def fit_to_judge(
     signals = tuple(runs)
     if not signals:
         raise DataError("gain: there is no run that was not used in the diagnosis")
-    low_pass, names = low_pass_of(signals), names_of(simulation.library)
-    info = evidence_at(signals, simulation, simulation.vector, names, low_pass)
+    about = simulation, simulation.vector, names_of(simulation.library), low_pass_of(signals)
+    info = evidence_at(signals, *about)
     excluded = unfit_runs(signals, info) if len(signals) >= MIN_JUDGED else ()
     if excluded:
-        gone = {run.run_id for run in excluded}
-        signals = tuple(run for run in signals if run.run_id not in gone)
+        gone = [run.run_id for run in excluded]
+        signals = tuple([run for run in signals if run.run_id not in gone])
         if not signals:
             raise DataError(f"gain: none of {len(runs)} runs is fit to be compared ({excluded[0].reason})")
-        info = evidence_at(signals, simulation, simulation.vector, names, low_pass)
+        info = evidence_at(signals, *about)
     return signals, tuple(excluded), info
 
 
-def _costs(info: Evidence, by_run: bool) -> Array:
+def _costs(info: Evidence, n_parts: int) -> Array:
     """Return what each cluster (n,) adds to minus twice the log-likelihood, its own scatter integrated out.
 
     Each third of a run has a scatter of its own, since parts of a common one need not be positive.
@@ -179,29 +191,11 @@ def _costs(info: Evidence, by_run: bool) -> Array:
     prior = np.diag(1.0 / info.nuisance_std**2)
     costs = []
     for white in info.white:
-        columns = white[[*info.nuisances, -1]].transpose(
-            1, 0, 2
-        )  # rows first, so that clusters are cut of all
-        for part in _clusters(columns, by_run):
-            gram = np.einsum("mqc,mpc->qp", part, part)
+        for part in np.array_split(white[[*info.nuisances, -1]], n_parts, axis=1):
+            gram = np.einsum("qmc,pmc->qp", part, part)
             shown = gram[:-1, -1]
             costs.append(float(gram[-1, -1] - shown @ np.linalg.solve(gram[:-1, :-1] + prior, shown)))
     return np.array(costs)
-
-
-def _clusters(values: Array, by_run: bool) -> list[Array]:
-    return [values] if by_run else np.array_split(values, N_BLOCKS)
-
-
-def _reduction(before: Array, after: Array, weights: Array) -> tuple[float, tuple[float, float], bool]:
-    """Return the part of the square that is removed, its 95 % interval, and whether no gain can be claimed."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = 1.0 - (weights @ after) / (weights @ before)
-        ratio = float(1.0 - after.sum() / before.sum())
-    if not np.isfinite(ratios).any():
-        return math.nan, (math.nan, math.nan), True
-    low, high = percentile_interval(ratios)
-    return ratio, (low, high), not low > 0.0
 
 
 # -- What an extension gains for the robot's filter, against the truth of runs that have one ---------------
@@ -245,18 +239,16 @@ def filter_gain(runs: Sequence[RunLog], robot: Robot, extended: Simulation, seed
     if name is None or not known:
         return None
     better = replace(robot, effects=dict(extended.effects), effects_cov=np.empty((0, 0)))
-    rows: list[list[tuple[float, ...]]] = []
     try:
-        for run in known:
-            rows.append([_errors(estimate_run(run, one, name)) for one in (robot, better)])
+        rows = [[_errors(estimate_run(run, one, name)) for one in (robot, better)] for run in known]
     except TerrainError as error:
         return Comparison(name, str(error), len(known), {})
-    counts, errors = bootstrap_counts(len(rows), N_BOOTSTRAP, seed), {}
-    for key, both in zip(ERRORS, np.array(rows).transpose(2, 1, 0), strict=True):
-        if np.isfinite(both).all():
-            changes = counts @ (both[1] - both[0]) / len(rows)
-            interval = percentile_interval(changes) if len(rows) > 1 else None
-            errors[key] = Change(float(both[0].mean()), float(both[1].mean()), interval)
+    errors = {}
+    for key, (before, after) in zip(ERRORS, np.array(rows).transpose(2, 1, 0), strict=True):
+        if np.isfinite(before + after).all():
+            interval = ratio_of_sums(after - before, np.ones(len(rows)), seed)[1]
+            of_means = float(before.mean()), float(after.mean())
+            errors[key] = Change(*of_means, interval if len(rows) > 1 else None)
     return Comparison(name, None, len(rows), errors)
 
 
@@ -285,11 +277,8 @@ def accuracy_change(before: Array, after: Array, run_id: Array, seed: int) -> Ch
     Change(before=0.5, after=1.0, change_ci=(0.0, 1.0))
     """
     runs, of = np.unique(run_id, return_inverse=True)
-    n = len(runs)
-    windows = np.bincount(of, minlength=n)
-    change = np.bincount(of, weights=after.astype(float) - before.astype(float), minlength=n)
-    counts = bootstrap_counts(n, N_BOOTSTRAP, seed)
-    interval = percentile_interval((counts @ change) / (counts @ windows))
+    change = np.bincount(of, weights=after.astype(float) - before.astype(float), minlength=len(runs))
+    interval = ratio_of_sums(change, np.bincount(of, minlength=len(runs)), seed)[1]
     return Change(float(before.mean()), float(after.mean()), interval)
 
 
@@ -332,10 +321,7 @@ class Reference(NamedTuple):
 
 
 def black_box_reference(
-    used: Sequence[ComparedRun],
-    held_out: Sequence[ComparedRun],
-    noise: Mapping[str, float],
-    seed: int = 0,
+    used: Sequence[ComparedRun], held_out: Sequence[ComparedRun], noise: Mapping[str, float], seed: int = 0
 ) -> Reference | None:
     """Return what a black-box reference, fitted to the runs used, reaches on runs held out; None without any.
 
@@ -343,54 +329,59 @@ def black_box_reference(
     """
     if not used or not held_out:
         return None
-    columns, test = (np.concatenate([_columns(run) for run in runs]) for runs in (used, held_out))
-    run_of_row = np.repeat(np.arange(len(held_out)), [len(run.time_s) for run in held_out])
+    from sklearn.linear_model import BayesianRidge
+
+    columns, test = [np.concatenate([_regressors(run) for run in runs]) for runs in (used, held_out)]
+    n_rows = np.array([len(run.time_s) for run in held_out])
     channels, total = {}, np.zeros(3)
     for name in measured_channels(used):
         c = CHANNELS.index(name)
         before = np.concatenate([run.residual(False)[:, c] for run in held_out])
-        known = np.isfinite(before)
-        if not known.any():
-            continue
         target = np.concatenate([run.residual(False)[:, c] for run in used])
-        after = before[known] - _predicted(columns, target, test[known])
-        named = rival = before[known]
+        judged = np.isfinite(before)
+        if not judged.any():
+            continue
+        # a constant where nothing varies
+        known = np.isfinite(target) & np.isfinite(columns).all(axis=1)
+        left = np.array([before[judged]] * 3)  # before, behind the reference, and with the named causes
+        mean, spread = columns[known].mean(axis=0), columns[known].std(axis=0)
+        use = spread > LEAST_RANGE
+        if use.any() and target[known].std() > 0.0:
+            x, there = [(rows[:, use] - mean[use]) / spread[use] for rows in (columns[known], test[judged])]
+            left[1] -= BayesianRidge().fit(x, target[known]).predict(np.nan_to_num(there))
+        elif known.any():
+            left[1] -= float(target[known].mean())
+        if held_out[0].after is not None:
+            left[2] = np.concatenate([run.residual(True)[:, c] for run in held_out])[judged]
+        square = np.zeros((3, judged.size))
+        square[:, judged] = left**2
+        by_run = np.add.reduceat(square, np.cumsum(n_rows) - n_rows, axis=1)
+        by_run = by_run[:, np.add.reduceat(judged, np.cumsum(n_rows) - n_rows) > 0]
+        low = math.nan
+        if by_run.shape[1] >= MIN_CLUSTERS:
+            low = ratio_of_sums(by_run[2] - by_run[1], by_run[0], seed)[1][0]
+        squares = square.sum(axis=1)
         if held_out[0].after is None:
-            named = np.full(after.size, np.nan)
-        else:
-            named = rival = np.concatenate([run.residual(True)[:, c] for run in held_out])[known]
-        squares = np.array([float(x @ x) for x in (before[known], after, named)])
-        rms_before, rms_after, _ = np.sqrt(squares / known.sum()).tolist()
-        left_low = _left_low(before[known] ** 2, rival**2 - after**2, run_of_row[known], seed)
-        channels[name] = ChannelReference(rms_before, rms_after, *_removed(squares), left_low)
+            squares[2] = math.nan
+        rms = np.sqrt(squares / judged.sum()).tolist()
+        channels[name] = ChannelReference(rms[0], rms[1], *_removed(squares), low)
         if noise.get(name, math.nan) > 0:
             total += squares / noise[name] ** 2
     return Reference(len(held_out), *_removed(total), channels)
 
 
-def _left_low(before: Array, more: Array, run_of_row: Array, seed: int) -> float:
-    """Return the lower end of the interval of what is removed more (n,), over the square before (n,)."""
-    parts = [run_of_row == run for run in np.unique(run_of_row)]
-    if len(parts) < MIN_CLUSTERS:
-        return math.nan
-    sums = np.array([[more[part].sum(), before[part].sum()] for part in parts])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ratios = np.divide(*(bootstrap_counts(len(parts), N_BOOTSTRAP, seed) @ sums).T)
-    return float(percentile_interval(ratios)[0]) if np.isfinite(ratios).any() else math.nan
-
-
 def _removed(squares: Array) -> tuple[float, float]:
     """Return the parts of the first square that are removed in the second and in the third."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        ratios = 1.0 - squares[1:] / squares[0]
-    return float(ratios[0]), float(ratios[1])
+        first, second = (1.0 - squares[1:] / squares[0]).tolist()
+    return first, second
 
 
-def _columns(run: ComparedRun) -> Array:
+def _regressors(run: ComparedRun) -> Array:
     """Return the regressors (m, k) of a run: a row at its ends takes the last input that there is."""
     inputs = [run.inputs[name] for name in DRIVEN]
     driven = [*inputs[:2], inputs[-1]]  # that is 0, and left out, but of omni robots
-    plain = [*inputs, *(np.abs(x) for x in driven), *(np.tanh(x / 0.05) for x in driven)]
+    plain = [*inputs, *[np.abs(x) for x in driven], *[np.tanh(x / 0.05) for x in driven]]
     products = [a * b for a, b in combinations_with_replacement(inputs, 2)]
     signed = [x * np.abs(x) for x in driven]
     at = np.arange(len(run.time_s))
@@ -398,18 +389,3 @@ def _columns(run: ComparedRun) -> Array:
     moving = np.column_stack([*inputs[:3], inputs[-1], inputs[0] * inputs[1], *signed])
     late = [moving[np.clip(at - lag, 0, at.size - 1)] for lag in LAGS]
     return np.hstack([np.column_stack([*plain, *products, *signed, *rates]), *late])
-
-
-def _predicted(columns: Array, target: Array, test: Array) -> Array:
-    """Return what a Bayesian linear regression of the target (n,) predicts for the test rows (m, k)."""
-    from sklearn.linear_model import BayesianRidge
-
-    known = np.isfinite(target) & np.isfinite(columns).all(axis=1)
-    mean, spread = columns[known].mean(axis=0), columns[known].std(axis=0)
-    use = spread > LEAST_RANGE
-    if not use.any() or not target[known].std() > 0.0:
-        return np.full(len(test), float(target[known].mean()) if known.any() else 0.0)
-    ridge = BayesianRidge()
-    ridge.fit((columns[known][:, use] - mean[use]) / spread[use], target[known])
-    out: Array = ridge.predict(np.nan_to_num((test[:, use] - mean[use]) / spread[use]))
-    return out

@@ -11,10 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from terrain.discrepancy.evidence import Evidence
+from terrain.discrepancy.evidence import Evidence, pooled_variance, z_of, z_of_t
 from terrain.discrepancy.noise import whiten
 from terrain.discrepancy.runs import INPUTS, Rows
-from terrain.discrepancy.selection import pooled_variance, z_of, z_of_t
 from terrain.effects import CHANNELS
 from terrain.records import Array
 
@@ -43,7 +42,7 @@ TILT_INPUTS = ("grade", "roll", "grade |speed|", "roll |speed|")
 class ProbeResult(NamedTuple):
     """Evidence of one probe."""
 
-    z: float  #: as of :class:`terrain.discrepancy.selection.WaldTest`
+    z: float  #: as of :class:`terrain.discrepancy.evidence.WaldTest`
     gain: float  #: fall of minus twice the log-likelihood, were it built in
     alike: Mapping[str, float] = MappingProxyType({})
     """By selected parameter, the correlation of what the input and the parameter change in the channel."""
@@ -56,8 +55,9 @@ class ProbeResult(NamedTuple):
 
 def probe_inputs(rows: Rows, rate_hz: float) -> dict[str, Array]:
     """Return the inputs (m,) that residuals are compared with, by name."""
-    speed, turn, steer, grade, roll, force, sideways = (rows.inputs[:, i] for i in range(7))
-    accel = np.gradient(speed) * rate_hz if len(speed) > 1 else np.zeros_like(speed)
+    speed, turn, steer, grade, roll, force, sideways = rows.inputs[:, :7].T
+    few = len(speed) < 2
+    accel, steering_rate = [np.zeros_like(x) if few else np.gradient(x) * rate_hz for x in (speed, steer)]
     tau = rows.time_s / 60.0 - 0.5
     direction = np.tanh(speed / STANDSTILL_MPS)
     crawl = np.exp(-((speed / CRAWL_MPS) ** 2)) * np.abs(direction)
@@ -79,9 +79,9 @@ def probe_inputs(rows: Rows, rate_hz: float) -> dict[str, Array]:
         "|sideways|": np.abs(sideways),
         "speed sideways": speed * sideways,
         "steering": steer,
-        "steering rate": np.gradient(steer) * rate_hz if len(steer) > 1 else np.zeros_like(steer),
+        "steering rate": steering_rate,
         "acceleration": accel,
-        "jerk": np.gradient(accel) * rate_hz if len(accel) > 1 else np.zeros_like(accel),
+        "jerk": accel if few else np.gradient(accel) * rate_hz,
         "grade": grade,
         "roll": roll,
         "roll |speed|": roll * np.abs(speed),
@@ -110,20 +110,30 @@ def probe_residuals(
     rate_hz = 1 / float(np.median(np.diff(info.rows[0].time_s)))
     results: dict[tuple[str, str], ProbeResult] = {}
     inputs = [probe_inputs(run, rate_hz) for run in info.rows]
+    change, info = change - info.away[info.places(names)], info.counted_from(info.origin)
     for c, channel in enumerate(CHANNELS):
         if not any(white[-1, :, c].any() for white in info.white):
             continue
-        columns = [_whitened(info, i, c, np.array(list(own.values()))) for i, own in enumerate(inputs)]
-        own = np.array([error.get((channel, name), 0.0) for name in inputs[0]])
-        tested = _results(info, names, change, c, columns, own)
+        columns = [_whitened(info, i, c, np.array([*own.values()])) for i, own in enumerate(inputs)]
+        known_error = np.array([error.get((channel, name), 0.0) for name in inputs[0]])
+        tested = _test_inputs(info, names, change, c, columns, known_error)
         results |= {(channel, name): result for name, result in zip(inputs[0], tested, strict=True)}
         for wheel in range(info.rows[0].inputs.shape[1] - len(INPUTS) + 1):
+            # the mean square of waves that no wheel makes: what they explain is no turn of a wheel
             false = np.concatenate([_wave_statistics(info, c, wheel, times) for times in PLACEBOS])
-            placebo = float(np.mean(false)) / 2.0 if false.size else 1.0
+            placebo = max(float(np.mean(false)) / 2.0, 1.0) if false.size else 1.0
             for harmonic in HARMONICS:
-                name = f"wheel {wheel + 1} turn" + ("" if harmonic == 1 else f" x{harmonic}")
-                waves = _wave_statistics(info, c, wheel, harmonic)
-                results[channel, name] = _wheel_turn_probe(waves, placebo)
+                waves = _wave_statistics(info, c, wheel, harmonic) / placebo
+                result = ProbeResult(0.0, 0.0)
+                if (
+                    waves.size
+                ):  # a phase of its own in each run; the median of chi^2 with 2 degrees is 2 log 2
+                    in_most_runs = float(np.median(waves)) > 2 * math.log(2.0) * 1.5
+                    z = z_of(float(chi2.logsf(waves.sum(), 2 * waves.size))) if in_most_runs else 0.0
+                    result = ProbeResult(z, float(waves.sum()) - 2 * waves.size)
+                results[channel, f"wheel {wheel + 1} turn" + ("" if harmonic == 1 else f" x{harmonic}")] = (
+                    result
+                )
     return results
 
 
@@ -154,13 +164,8 @@ def _products(
     )
 
 
-def _results(
-    info: Evidence,
-    names: Sequence[str],
-    change: Array,
-    c: int,
-    columns: Sequence[Array],
-    error: Array,
+def _test_inputs(
+    info: Evidence, names: Sequence[str], change: Array, c: int, columns: Sequence[Array], error: Array
 ) -> list[ProbeResult]:
     """Return the results of whitened columns (q, m) a run, in channel c, where the simulation has an error (q,).
 
@@ -169,17 +174,15 @@ def _results(
     """
     at, q = info.places(names), len(columns[0])
     selected, probe = slice(0, len(at)), slice(len(at), len(at) + q)
-    products: list[Array] = []
-    first: list[int] = []
-    for i, (run, own_columns) in enumerate(zip(info.rows, columns, strict=True)):
-        n_blocks = max(round(float(run.time_s[-1] - run.time_s[0]) / BLOCK_S), 1)
-        first.append(sum(len(blocks) for blocks in products))
-        edges = np.linspace(0, len(run.time_s), n_blocks + 1).astype(int)
-        products.append(_products(info, i, c, at, own_columns, edges))
+    n_blocks = [max(round(float(run.time_s[-1] - run.time_s[0]) / BLOCK_S), 1) for run in info.rows]
+    first = np.cumsum([0, *n_blocks[:-1]])
+    products = []
+    for i, n in enumerate(n_blocks):
+        edges = np.linspace(0, len(info.rows[i].time_s), n + 1).astype(int)
+        products.append(_products(info, i, c, at, columns[i], edges))
     every = np.concatenate(products)
-    fitted = change - info.away[at]
     a = (every[:, selected, selected] + every[:, selected, selected].transpose(0, 2, 1)) / 2.0
-    g = every[:, selected, -1] - a @ fitted
+    g = every[:, selected, -1] - a @ change
     own = np.diagonal(every[:, probe, probe], axis1=1, axis2=2)
     cross, score = every[:, probe, selected], every[:, probe, -1]
     follow = np.zeros((0, q))
@@ -187,10 +190,18 @@ def _results(
         follow = np.linalg.lstsq(a.sum(axis=0), cross.sum(axis=0).T, rcond=1e-10)[0]
     free = own.sum(axis=0) - (cross.sum(axis=0) * follow.T).sum(axis=1)
     sizes = own - 2 * (cross * follow.T).sum(axis=2) + ((a @ follow) * follow).sum(axis=1)
-    part = score - cross @ fitted - g @ follow
+    part = score - cross @ change - g @ follow
     enough = free > 1e-6 * np.maximum(own.sum(axis=0), 1e-12)
-    by_model = _model_variance(info, at, c, columns, follow) + (np.where(enough, free, 0.0) * error) ** 2
-    power = sum(((white[at][:, :, c] ** 2).sum(axis=1) for white in info.white), np.zeros(len(at)))
+    # variance of the score by the simulation's own error; of several parameters the largest counts: each error was
+    # measured as if it were alone
+    doubtful = np.flatnonzero(info.model_std)
+    shown = -follow.T @ info.a[:, at][:, :, doubtful].sum(axis=0)
+    power = np.zeros(len(at))
+    for x, white, shift in zip(columns, info.white, info.marginal[1], strict=True):
+        shown += x @ (white[doubtful, :, c] - shift[:, doubtful].T @ white[info.nuisances, :, c]).T
+        power += (white[at][:, :, c] ** 2).sum(axis=1)
+    by_model = ((shown * info.model_std[doubtful]) ** 2).max(axis=1, initial=0.0)
+    by_model = by_model + (np.where(enough, free, 0.0) * error) ** 2
     both = np.sqrt(np.outer(own.sum(axis=0), power))
     alike = np.divide(np.abs(cross.sum(axis=0)), both, out=np.zeros_like(both), where=both > 1e-9)
     results = []
@@ -199,13 +210,11 @@ def _results(
             results.append(ProbeResult(0.0, 0.0))
             continue
         total, information = float(part[:, k].sum()), float(free[k])
-        left = part[:, k] - sizes[:, k] * total / information
+        left, ratio = part[:, k] - sizes[:, k] * total / information, sizes[:, k] / information
         # the variance of the score is estimated between blocks, or between runs
-        by_run = (np.add.reduceat(each, first) for each in (left, sizes[:, k]))
-        (variance, dof), over_runs = (
-            pooled_variance(scores, np.clip(shares / information, 0.0, 0.9), information)
-            for scores, shares in ((left, sizes[:, k]), by_run)
-        )
+        variance, dof = pooled_variance(left, np.clip(ratio, 0.0, 0.9), information)
+        of_runs = np.add.reduceat(left, first), np.clip(np.add.reduceat(ratio, first), 0.0, 0.9)
+        over_runs = pooled_variance(*of_runs, information)
         if over_runs[0] > RUN_RATIO * variance:
             variance, dof = over_runs
         z = z_of_t(abs(total) / math.sqrt(information * variance + float(by_model[k])), dof)
@@ -214,40 +223,14 @@ def _results(
     return results
 
 
-def _model_variance(info: Evidence, at: list[int], c: int, columns: Sequence[Array], follow: Array) -> Array:
-    """Return the variance (q,) of a probe's score by the simulation's own error.
-
-    Of errors in units of several parameters the largest counts: each was measured as if it were alone.
-    """
-    doubtful = np.flatnonzero(info.model_std)
-    shown = -follow.T @ info.a[:, at][:, :, doubtful].sum(axis=0)
-    for x, white, shift in zip(columns, info.white, info.marginal[1], strict=True):
-        shown += x @ (white[doubtful, :, c] - shift[:, doubtful].T @ white[info.nuisances, :, c]).T
-    return np.asarray(((shown * info.model_std[doubtful]) ** 2).max(axis=1, initial=0.0))
-
-
-def _wheel_turn_probe(statistics: Array, placebo: float) -> ProbeResult:
-    """Return the result of a wave with a phase of its own in each run: two columns a run.
-
-    ``placebo`` is the mean square of waves that no wheel makes: what they explain is no turn of a wheel.
-    """
-    if not statistics.size:
-        return ProbeResult(0.0, 0.0)
-    each = statistics / max(placebo, 1.0)
-    z = z_of(float(chi2.logsf(each.sum(), 2 * each.size)))
-    # the median of chi^2 with 2 degrees is 2 log 2
-    in_most_runs = float(np.median(each)) > 2 * math.log(2.0) * 1.5
-    return ProbeResult(z if in_most_runs else 0.0, float(each.sum()) - 2 * each.size)
-
-
 def _wave_statistics(info: Evidence, c: int, wheel: int, times: float) -> Array:
     """Return what a multiple of a wheel's angle explains of each run (runs,), as chi^2 with 2 degrees."""
-    each = []
+    explained = []
     for i, run in enumerate(info.rows):
         phase = times * run.inputs[:, len(INPUTS) - 1 + wheel]
         waves = _whitened(info, i, c, run.inputs[:, 0] * np.array([np.cos(phase), np.sin(phase)]))
         (products,) = _products(info, i, c, [], waves, (0, len(phase)))
         own, score = products[:2, :2], products[:2, 2]
         if np.linalg.eigvalsh(own)[0] > 1e-6:
-            each.append(float(score @ np.linalg.solve(own, score)))
-    return np.array(each)
+            explained.append(float(score @ np.linalg.solve(own, score)))
+    return np.array(explained)

@@ -73,7 +73,7 @@ class Simulation:
     #: stated
     model_error: Mapping[str, float] = field(default_factory=dict)
     #: mean over runs and scatter of them that conditions may make which differ from run to run, in units of parameters:
-    #: see :mod:`terrain.discrepancy.varying`
+    #: see :mod:`terrain.discrepancy.constancy`
     varied_error: Mapping[str, float] = field(default_factory=dict)
     varied_scatter: Mapping[str, float] = field(default_factory=dict)
     #: how much the residual of a channel depends on an input by the simulation's own error

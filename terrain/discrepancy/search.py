@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from terrain.discrepancy.evidence import (
     Evidence,
-    Statistics,
+    WaldTest,
     correlation,
     evidence_at,
-    fit_change,
-    loss_of,
     move_point,
     partial_information,
+    wald_test,
     whiten_run,
 )
 from terrain.discrepancy.runs import LowPass, Signals, Simulation, rows_of
-from terrain.discrepancy.selection import WaldTest, wald_test
 from terrain.effects import BOUNDS, INDEX, Effect
 from terrain.records import Array
 
@@ -41,16 +39,6 @@ ends them."""
 RIVAL_REFITS = 3  #: Most relinearisations of a rival
 
 
-class Nearby(NamedTuple):
-    """Quadratic form of a few parameters at another point, by the noise and scatter of an evidence, of all runs."""
-
-    vector: Array  #: the point
-    a: Array  #: (k, k)
-    g: Array  #: (k,)
-    c: float
-    white_residual: tuple[Array, ...]  #: of each run (rows, channels)
-
-
 class Problem(NamedTuple):
     """Runs, the simulation, the low-pass of all, and the effects that may be named."""
 
@@ -66,35 +54,30 @@ class Problem(NamedTuple):
         """Standard deviation from run to run that is assumed, by parameter."""
         return {**self.simulation.scatter, **self.varying}
 
-    def at(
-        self,
-        vector: Array,
-        names: Sequence[str] | None = None,
-        statistics: Statistics | None = None,
-        own: Mapping[str, Array] | None = None,
-    ) -> Evidence:
+    def at(self, vector: Array, names: Sequence[str] | None = None, **about: Any) -> Evidence:
         """Return the evidence of the runs around a point, on the library by default; see :func:`evidence_at`."""
-        names = names_of(self.library) if names is None else names
-        about = self.low_pass, statistics, own, self.scatter
-        return evidence_at(self.signals, self.simulation, vector, names, *about)
+        names, about = names_of(self.library) if names is None else names, {"scatter": self.scatter, **about}
+        return evidence_at(self.signals, self.simulation, vector, names, self.low_pass, **about)
 
-    def near(self, info: Evidence, vector: Array, names: Sequence[str]) -> Nearby:
-        """Return the form of a few parameters at another point; much faster than the evidence there."""
+    def near(self, info: Evidence, vector: Array, names: Sequence[str]) -> Evidence:
+        """Return the evidence of all runs together on a few parameters at another point, what varies integrated out.
+
+        Noise and scatter are those of the evidence given; it is much faster than the evidence there.
+        """
         k, white = len(names), []
-        total = np.zeros((k + 1, k + 1))
-        planar = {run.terrain: self.simulation.planar_on(run.terrain) for run in self.signals}
+        total = np.zeros((1, 1, k + 1, k + 1))
         for run, around, inner in zip(self.signals, info.white, info.marginal[2], strict=True):
-            rows = rows_of(run, planar[run.terrain], vector, names, self.low_pass)
-            columns = whiten_run(info.noise, rows)
+            planar = self.simulation.planar_on(run.terrain)
+            columns = whiten_run(info.noise, rows_of(run, planar, vector, names, self.low_pass))
             flat = columns.reshape(k + 1, -1)
             along = around[info.nuisances].reshape(len(info.nuisances), flat.shape[1]) @ flat.T
             total += flat @ flat.T - along.T @ inner @ along
-            white.append(columns[-1])
-        return Nearby(vector, total[:k, :k], total[:k, k], float(total[k, k]), tuple(white))
+            white.append(columns)
+        return Evidence(tuple(names), vector, vector, total, {}, (), info.noise, tuple(white), np.zeros(k))
 
 
-def misfit_of(info: Evidence, white_residual: Sequence[Array]) -> float:
-    """Return by how much the whole library could still reduce residuals (rows, channels) of runs at another point.
+def misfit_of(info: Evidence, there: Evidence) -> float:
+    """Return by how much the whole library could still reduce the residuals at another point.
 
     Sensitivities and noise of ``info`` are the measure, by which residuals are whitened.  Up to a constant it is
     minus twice the log-likelihood there, as far as the problem is linear.  The sum of squares itself will not do:
@@ -102,19 +85,10 @@ def misfit_of(info: Evidence, white_residual: Sequence[Array]) -> float:
     be judged by it.
     """
     score = np.zeros(len(info.names))
-    for residual, white, shift in zip(white_residual, info.white, info.marginal[1], strict=True):
-        flat = white[:-1].reshape(len(score), -1) @ residual.ravel()
+    for other, white, shift in zip(there.white, info.white, info.marginal[1], strict=True):
+        flat = white[:-1].reshape(len(score), -1) @ other[-1].ravel()
         score += flat - shift[:, :-1].T @ flat[info.nuisances]
     return float(score @ np.linalg.solve(info.freed, score))
-
-
-class Refit(NamedTuple):
-    """A nonlinear fit."""
-
-    loss: float  #: how badly it fits, as minus twice a log-likelihood; see :func:`misfit_of`
-    square: float  #: whitened square that it leaves
-    change: Array  #: (k,) of its parameters
-    std: Array
 
 
 def names_of(effects: Sequence[Effect]) -> tuple[str, ...]:
@@ -126,52 +100,47 @@ def names_of(effects: Sequence[Effect]) -> tuple[str, ...]:
     >>> names_of([effect_named("lever_arm")])
     ('lever_x_m', 'lever_y_m')
     """
-    return tuple(dict.fromkeys(p.name for effect in effects for p in effect.parameters))
+    return tuple(dict.fromkeys([p.name for effect in effects for p in effect.parameters]))
 
 
-def steps_of(
-    problem: Problem, info: Evidence, base: Array, names: Sequence[str], n_most: int
-) -> Iterator[Nearby]:
-    """Yield the forms at the points of a nonlinear fit of parameters, until it converges.
+def steps_of(problem: Problem, info: Evidence, names: Sequence[str], n_most: int) -> Iterator[Evidence]:
+    """Yield the evidence at the points of a nonlinear fit of parameters, until it converges.
 
     A step that raises the whitened square is halved, and given up after :data:`MAX_HALVINGS`.
     """
-    at = [INDEX[name] for name in names]
-    others = np.delete(info.origin - base, at)
-    here, loss = info.origin[at] - base[at], np.inf if others.any() else info.origin_loss
-    change, _ = fit_change(info, names)
+    base, at = info.vector, [INDEX[name] for name in names]
+    here, loss = info.origin[at] - base[at], np.inf
+    if not np.delete(info.origin - base, at).any():  # it is where the fit may start
+        loss = float((info.c - 2.0 * info.g @ info.away + info.away @ info.a @ info.away).sum())
+    change, _ = info.fit(names)
     for _ in range(n_most):
         point = problem.near(info, move_point(base, names, change), names)
         for _ in range(MAX_HALVINGS):
-            if point.c <= (1.0 + RISE) * loss:
+            if point.c[0] <= (1.0 + RISE) * loss:
                 break
             change = 0.5 * (here + change)
             point = problem.near(info, move_point(base, names, change), names)
         yield point
-        cov = np.linalg.pinv(point.a, hermitian=True)
-        here, loss = point.vector[at] - base[at], point.c
-        change = here + cov @ point.g
+        here, loss = point.vector[at] - base[at], float(point.c[0])
+        step, cov = point.fit(names)
+        change = here + step
         if (np.abs(change - here) < SETTLED * np.sqrt(np.maximum(np.diag(cov), 1e-30))).all():
             return
 
 
-def relinearize(problem: Problem, info: Evidence, base: Array, causes: Sequence[Effect]) -> Evidence:
+def relinearize(problem: Problem, info: Evidence, causes: Sequence[Effect]) -> Evidence:
     """Fit, and return the evidence around the fitted point."""
-    point = info.origin if causes else base
-    for near in steps_of(problem, info, base, names_of(causes), MAX_REFITS):
+    point = info.vector
+    for near in steps_of(problem, info, names_of(causes), MAX_REFITS if causes else 0):
         point = near.vector
-    return replace(problem.at(point), vector=base)
+    return problem.at(point).counted_from(info.vector)
 
 
-def fit_again(problem: Problem, info: Evidence, base: Array, names: Sequence[str]) -> Refit:
-    """Return the best point of a nonlinear fit of parameters."""
-    points = steps_of(problem, info, base, names, RIVAL_REFITS)
-    misfit, near = min(
-        ((misfit_of(info, near.white_residual), near) for near in points), key=lambda pair: pair[0]
-    )
-    at = [INDEX[name] for name in names]
-    std = np.sqrt(np.maximum(np.diag(np.linalg.pinv(near.a, hermitian=True)), 0.0))
-    return Refit(misfit + PARAMETER_LOSS * len(names), near.c, near.vector[at] - base[at], std)
+def fit_again(problem: Problem, info: Evidence, names: Sequence[str]) -> tuple[float, Evidence]:
+    """Return how badly the best point of a nonlinear fit fits (:func:`misfit_of`), and the evidence there."""
+    points = [(misfit_of(info, near), near) for near in steps_of(problem, info, names, RIVAL_REFITS)]
+    misfit, near = min(points, key=lambda pair: pair[0])
+    return misfit + PARAMETER_LOSS * len(names), near
 
 
 # -- Effects that fit as well as a cause in its place, by nonlinear fits -----------------------------------
@@ -195,45 +164,41 @@ SHARED = 0.5
 """Least correlation of what a cause and its rival change: one that shares less with it explains something
 else, and is no rival, however little worse it fits."""
 
-
-class Rival(NamedTuple):
-    """An effect that fits as well as a cause in its place."""
-
-    effect: Effect
-    #: by how much it fits worse, as minus twice a log-likelihood, over the inflation of the cause
-    behind: float
-    change: Array  #: (p,) of its parameters, by a fit of its own; a value may be at its bound
-    std: Array
+Rivals = Mapping[str, tuple[Array, Array]]
+"""By effect that fits as well as a cause in its place, the best first, its values and their standard deviations."""
 
 
 def rivals_of(
     problem: Problem, info: Evidence, start: Evidence, causes: Sequence[Effect]
-) -> dict[str, tuple[Rival, ...]]:
-    """Return by cause all effects that, refitted in its place, fit as well as it does, the best first.
+) -> Mapping[str, Rivals]:
+    """Return by cause all effects that, refitted in its place, fit as well as it does.
 
     It is compared by the noise that the causes leave and by that of the simulation as it is given: a cause
     that absorbs noise is ahead by only one of them.  Where runs disagree on a cause by more than the noise
     allows, losses count that much less, as a quasi-likelihood has them.  Where much is wrong, neither is a
     likelihood: a rival that leaves a larger square than the noise of the wheels can make is none.
     """
-    base, judges = start.vector, (info, start)
     runs_alone = replace(info, model_std=np.zeros_like(info.model_std))  # in what all runs have they agree
-    own: list[Refit] = []  # losses of the causes by both judges, where anything comes near
+    own: list[tuple[float, Evidence]] = []  # the causes by both judges, where anything comes near
     rivals = {}
     for cause in causes:
         others = [other for other in causes if other is not cause]
         inflation = wald_test(runs_alone, names_of(others), cause).inflation
         as_good = []
         for effect, alike in _near(problem, info, cause, others, inflation):
-            own = own or [fit_again(problem, judge, base, names_of(causes)) for judge in judges]
+            own = own or [fit_again(problem, judge, names_of(causes)) for judge in (info, start)]
             swapped = names_of([*others, effect])
-            here, there = (fit_again(problem, judge, base, swapped) for judge in judges)
-            behind = min(here.loss - own[0].loss, there.loss - own[1].loss) / inflation
-            worse = here.square > (1.0 + RIVAL_RISE) * own[0].square + RIVAL_LOSS * inflation
+            fits = [fit_again(problem, judge, swapped) for judge in (info, start)]
+            behind = min(fits[0][0] - own[0][0], fits[1][0] - own[1][0]) / inflation
+            here, square = fits[0][1], float(own[0][1].c[0])
+            worse = float(here.c[0]) > (1.0 + RIVAL_RISE) * square + RIVAL_LOSS * inflation
             if not worse and behind < (TWIN_LOSS if alike > TWIN else RIVAL_LOSS):
-                at = [swapped.index(p.name) for p in effect.parameters]
-                as_good.append(Rival(effect, behind, here.change[at], here.std[at]))
-        rivals[cause.name] = tuple(sorted(as_good, key=lambda rival: rival.behind))
+                its = [p.name for p in effect.parameters]
+                at, places = [INDEX[name] for name in its], here.places(its)
+                std = np.sqrt(np.maximum(np.diag(here.fit(swapped)[1]), 0.0))[places]
+                as_good.append((behind, effect.name, here.vector[at] - info.vector[at], std))
+        as_good.sort(key=lambda rival: rival[0])
+        rivals[cause.name] = {name: (change, std) for _, name, change, std in as_good}
     return rivals
 
 
@@ -241,13 +206,12 @@ def _near(
     problem: Problem, info: Evidence, cause: Effect, others: Sequence[Effect], inflation: float
 ) -> Iterator[tuple[Effect, float]]:
     """Yield the effects that come near a cause beside the others by linear fits, and how alike the two are."""
-    now, beside = loss_of(info, names_of([*others, cause])), names_of(others)
-    gain = loss_of(info, beside) - now
-    most = min(RIVAL_LINEAR * inflation, RIVAL_LOSS * inflation + RIVAL_RATIO * gain)
+    now, beside = info.loss(names_of([*others, cause])), names_of(others)
+    most = min(RIVAL_LINEAR * inflation, RIVAL_LOSS * inflation + RIVAL_RATIO * (info.loss(beside) - now))
     for effect in problem.library:
-        if effect is cause or effect in others or loss_of(info, names_of([*others, effect])) - now >= most:
+        if effect is cause or effect in others or info.loss(names_of([*others, effect])) - now >= most:
             continue
-        base, own, its = (info.places(names) for names in (beside, names_of([cause]), names_of([effect])))
+        base, own, its = [info.places(names) for names in (beside, names_of([cause]), names_of([effect]))]
         free = partial_information(info.a.sum(axis=0), base, [*own, *its])[1]
         alike = correlation(free, range(len(own)), range(len(own), len(free)))
         if alike > SHARED and wald_test(info, beside, effect).inside:
@@ -281,9 +245,11 @@ class CauseFit(NamedTuple):
     change: Array
     cov: Array
     tests: dict[str, WaldTest]  #: evidence of every effect of the library beside them
-    assumed_scatter: Mapping[str, float]  #: from run to run, by parameter, that is no news
-    rivals: Mapping[str, tuple[Rival, ...]] = MappingProxyType({})
-    """By cause, the effects that fit as well in its place, once they have been looked for."""
+    rivals: Mapping[str, Rivals] = MappingProxyType({})  #: by cause, once they have been looked for
+
+    def at(self, effect: Effect) -> list[int]:
+        """Return the places of the parameters of a cause."""
+        return [self.names.index(p.name) for p in effect.parameters]
 
 
 def search(problem: Problem, start: Evidence, seeds: Mapping[str, float] | None = None) -> CauseFit:
@@ -292,152 +258,121 @@ def search(problem: Problem, start: Evidence, seeds: Mapping[str, float] | None 
     Where values of parameters (``seeds``) are so large that sensitivities without them would mislead, as lags of
     sensors, other causes are first searched with them built in, then all are fitted together.
     """
-    base, info = start.vector, start
-    causes: list[Effect] = []
+    causes, info = [], start
     if seeds:
-        there = move_point(base, tuple(seeds), np.array(list(seeds.values())))
-        first, info = _add_causes(problem, problem.at(there), there, [])
+        there = problem.at(move_point(start.vector, [*seeds], [*seeds.values()]))
+        first, info = _add_causes(problem, there, [])
         seeded = [effect for effect in problem.library if set(names_of([effect])) & set(seeds)]
-        causes = [*seeded, *(cause for cause in first if cause not in seeded)]
-        causes, info = _refit_significant(problem, replace(info, vector=base), base, causes)
-    causes, info = _add_causes(problem, info, base, causes)
+        causes = [*seeded, *[cause for cause in first if cause not in seeded]]
+        causes, info = _refit_significant(problem, info.counted_from(start.vector), causes)
+    causes, info = _add_causes(problem, info, causes)
     return cause_fit(problem, info, causes)
 
 
-def refit(problem: Problem, start: Evidence, info: Evidence, causes: Sequence[Effect]) -> CauseFit:
+def refit(problem: Problem, info: Evidence, causes: Sequence[Effect]) -> CauseFit:
     """Return some causes, fitted without others; those that are no longer significant are dropped."""
-    significant, info = _refit_significant(problem, info, start.vector, list(causes))
+    significant, info = _refit_significant(problem, info, list(causes))
     return cause_fit(problem, info, significant)
 
 
 def cause_fit(problem: Problem, info: Evidence, causes: Sequence[Effect]) -> CauseFit:
     """Return the values of causes by the evidence at their fit, and the evidence of every effect beside them."""
     names = names_of(causes)
-    tests = {
-        effect.name: wald_test(info, [n for n in names if n not in names_of([effect])], effect)
-        for effect in problem.library
-    }
-    return CauseFit(
-        tuple(causes), info, names, *fit_change(info, names), tests, problem.simulation.known_scatter
-    )
+    tests = {effect.name: wald_test(info, names, effect) for effect in problem.library}
+    return CauseFit(tuple(causes), info, names, *info.fit(names), tests)
 
 
-def _add_causes(
-    problem: Problem, info: Evidence, base: Array, causes: list[Effect]
-) -> tuple[list[Effect], Evidence]:
-    """Add effects, refit, drop and swap, until none is significant that is not there."""
+def _add_causes(problem: Problem, info: Evidence, causes: list[Effect]) -> tuple[list[Effect], Evidence]:
+    """Add effects, refit, drop and swap, until none is significant that is not there.
+
+    The next effect is that with the largest gain on runs left out, or a pair where none is significant alone.
+    Where much is wrong the linear gain is inaccurate: then the best few are compared by nonlinear fits.
+    """
     barred: set[str] = set()  # added to the current causes, and dropped again
-    seen = {_set_of(causes)}  # sets that were reached; none twice, or the search goes in circles
-    fits: dict[tuple[frozenset[str], str], Refit] = {}  # none is made twice
+    seen = {frozenset(causes)}  # sets that were reached; none twice, or the search goes in circles
+    fits: dict[tuple[frozenset[Effect], Effect], tuple[float, Evidence]] = {}  # none is made twice
 
-    def fit(effect: Effect) -> Refit:
-        key = _set_of(causes), effect.name
+    def fit(effect: Effect) -> tuple[float, Evidence]:
+        key = frozenset(causes), effect
         if key not in fits:
-            fits[key] = fit_again(problem, info, base, names_of([*causes, effect]))
+            fits[key] = fit_again(problem, info, names_of([*causes, effect]))
         return fits[key]
 
     for _ in range(MAX_STEPS):
+        names, candidates = names_of(causes), []
         left = [effect for effect in problem.library if effect not in causes and effect.name not in barred]
-        new = _next(info, base, causes, left, fit)
+        for effect in left:
+            test = wald_test(info, names, effect)
+            gain, passes = float(test.gain.sum()), test.significant
+            if not test.inside and gain >= MUCH_GAIN and test._replace(inside=True).significant:
+                # a robot that turns twice as fast as it should has half the track, which straight lines take for
+                # none
+                vector = fit(effect)[1].vector
+                own = [(vector[INDEX[name]], *BOUNDS[name]) for name in names_of([*causes, effect])]
+                passes = all(low < value < high for value, low, high in own)
+            if passes:
+                candidates.append((gain, effect))
+        candidates.sort(key=lambda pair: -pair[0])
+        close = [e for gain, e in candidates[:MAX_FITTED] if gain > CLOSE_GAIN * candidates[0][0]]
+        new = [effect for _, effect in candidates[:1]] or _pair(info, names, left)
+        if len(close) > 1 and candidates[0][0] >= MUCH_GAIN:
+            new = [min(close, key=lambda effect: fit(effect)[0])]
         if not new or len(causes) + len(new) > MAX_CAUSES:
             break
-        more, at = _refit_significant(problem, info, base, [*causes, *new], seen)
+        more, at = _refit_significant(problem, info, [*causes, *new], seen)
         if at is not info:
-            more, at = _swap_for_better(problem, at, base, more)
-        if _set_of(more) not in seen:
-            seen.add(_set_of(more))
-            barred = set()
-            causes, info = more, at
+            more, at = _swap_for_better(problem, at, more)
+        if frozenset(more) not in seen:
+            seen.add(frozenset(more))
+            barred, causes, info = set(), more, at
         barred |= {effect.name for effect in new if effect not in causes}
     return causes, info
 
 
-def _next(
-    info: Evidence,
-    base: Array,
-    causes: Sequence[Effect],
-    left: Sequence[Effect],
-    fit: Callable[[Effect], Refit],
-) -> list[Effect]:
-    """Return the effect with the largest gain on runs left out, or a pair where none is significant alone.
-
-    Where much is wrong the linear gain is inaccurate: then the best few are compared by nonlinear fits.
-    """
-    names = names_of(causes)
-
-    def inside_by_fit(effect: Effect, test: WaldTest) -> bool:
-        # a robot that turns twice as fast as it should has half the track, which straight lines take for none
-        if test.inside or not test._replace(inside=True).significant or test.gain.sum() < MUCH_GAIN:
-            return False
-        every = names_of([*causes, effect])
-        values = base[[INDEX[name] for name in every]] + fit(effect).change
-        return all(
-            BOUNDS[name][0] < value < BOUNDS[name][1] for name, value in zip(every, values, strict=True)
-        )
-
-    tests = [(effect, wald_test(info, names, effect)) for effect in left]
-    candidates = [
-        (float(test.gain.sum()), effect)
-        for effect, test in tests
-        if test.significant or inside_by_fit(effect, test)
-    ]
-    if not candidates:
-        return _pair(info, names, left)
-    candidates.sort(key=lambda pair: -pair[0])
-    best = candidates[0][0]
-    close = [effect for gain, effect in candidates[:MAX_FITTED] if gain > CLOSE_GAIN * best]
-    if best < MUCH_GAIN or len(close) == 1:
-        return [candidates[0][1]]
-    return [min(close, key=lambda effect: fit(effect).loss)]
-
-
 def _refit_significant(
-    problem: Problem,
-    info: Evidence,
-    base: Array,
-    causes: list[Effect],
-    seen: Set[frozenset[str]] = frozenset(),
+    problem: Problem, info: Evidence, causes: list[Effect], seen: Set[frozenset[Effect]] = frozenset()
 ) -> tuple[list[Effect], Evidence]:
     """Refit causes, and drop the weakest until all are significant beside the others.
 
     A set that was reached before is not fitted again: the information is the one given.
     """
     at = info
-    while _set_of(causes) not in seen:
-        at = relinearize(problem, at, base, causes)
+    while frozenset(causes) not in seen:
+        at = relinearize(problem, at, causes)
         weak = _weakest(at, causes) if causes else None
         if weak is None:
             return causes, at
-        causes = [cause for i, cause in enumerate(causes) if i != weak]
+        causes = [cause for cause in causes if cause is not weak]
     return causes, info
 
 
-def _set_of(causes: Sequence[Effect]) -> frozenset[str]:
-    return frozenset(cause.name for cause in causes)
+def _weakest(info: Evidence, causes: Sequence[Effect]) -> Effect | None:
+    """Return the least significant cause, None if all are significant beside the others."""
+    tests = [
+        wald_test(info, names_of([other for other in causes if other is not cause]), cause)
+        for cause in causes
+    ]
+    z = [np.inf if test.significant else test.z for test in tests]
+    return None if min(z) == np.inf else causes[int(np.argmin(z))]
 
 
-def _swap_for_better(
-    problem: Problem, info: Evidence, base: Array, causes: list[Effect]
-) -> tuple[list[Effect], Evidence]:
+def _swap_for_better(problem: Problem, info: Evidence, causes: list[Effect]) -> tuple[list[Effect], Evidence]:
     """Replace a cause by an effect that fits better, as long as there is one."""
-
-    def penalised_loss(effects: Sequence[Effect]) -> float:
-        names = names_of(effects)
-        return loss_of(info, names) + PARAMETER_LOSS * len(names)
-
     for _ in range(MAX_CAUSES):
-        least, better = penalised_loss(causes) - RIVAL_LOSS, None
+        names = names_of(causes)
+        least, better = info.loss(names) + PARAMETER_LOSS * len(names) - RIVAL_LOSS, None
         for i, cause in enumerate(causes):
             others = names_of([other for other in causes if other is not cause])
             for effect in problem.library:
                 if effect in causes or not wald_test(info, others, effect).significant:
                     continue
                 changed = [*causes[:i], effect, *causes[i + 1 :]]
-                if (loss := penalised_loss(changed)) < least:
+                names = names_of(changed)
+                if (loss := info.loss(names) + PARAMETER_LOSS * len(names)) < least:
                     least, better = loss, changed
         if better is None:
             break
-        swapped, at = _refit_significant(problem, info, base, better)
+        swapped, at = _refit_significant(problem, info, better)
         if len(swapped) < len(causes):
             break
         causes, info = swapped, at
@@ -471,16 +406,6 @@ def _pair(info: Evidence, names: Sequence[str], library: Sequence[Effect]) -> li
     return []
 
 
-def _weakest(info: Evidence, causes: Sequence[Effect]) -> int | None:
-    """Return the least significant cause, None if all are significant beside the others."""
-    z = []
-    for cause in causes:
-        test = wald_test(info, names_of([other for other in causes if other is not cause]), cause)
-        z.append(np.inf if test.significant else test.z)
-    weakest = int(np.argmin(z))
-    return weakest if np.isfinite(z[weakest]) else None
-
-
 # -- Values of named causes that one simulation has for all runs -------------------------------------------
 # While causes are searched, a parameter that differs from run to run has a deviation of its own in each, and
 # the fit is the mean over runs.  A simulation has one value, and the best one is that which leaves the least
@@ -499,22 +424,20 @@ N_STEPS = 4
 def pooled(problem: Problem, fit: CauseFit) -> CauseFit:
     """Return the causes with the values that leave the least square over all runs."""
     assumed = problem.simulation.scatter
-    scatter = {name: std for name, std in fit.info.statistics.scatter.items() if name in assumed}
+    scatter = {name: std for name, std in fit.info.scatter.items() if name in assumed}
     own = [n for n in fit.names if n in scatter and scatter[n] > SCATTERS_RATIO * assumed[n]]
     if not own and not problem.varying:
         return fit
-    problem = problem._replace(varying={})
-    statistics = Statistics(fit.info.noise, scatter | {name: assumed[name] for name in own})
-    base = problem.simulation.vector
+    held = scatter | {name: assumed[name] for name in own}
     point, change = fit.info.origin, fit.change
     for _ in range(N_STEPS):
-        info = replace(problem.at(point, fit.names, statistics), vector=base)
-        change = fit_change(info, fit.names)[0]
-        point = base.copy()
+        info = problem.at(point, fit.names, noise=fit.info.noise, scatter=held)
+        info = info.counted_from(problem.simulation.vector)
+        change, inverse = info.fit(fit.names)
+        point = problem.simulation.vector
         point[[INDEX[name] for name in fit.names]] += change
     a, _ = info.clusters(info.places(fit.names))
     mine = [fit.names.index(name) for name in own]
     more = np.diag([scatter[name] ** 2 - assumed[name] ** 2 for name in own])
     b = a.sum(axis=0) + np.einsum("nip,pq,njq->ij", a[:, :, mine], more, a[:, :, mine])
-    inverse = np.linalg.pinv(a.sum(axis=0), hermitian=True)
     return fit._replace(change=change, cov=inverse @ b @ inverse)

@@ -59,7 +59,7 @@ class Cause(NamedTuple):
     held_out_gain: float
     gain_ci: tuple[float, float]  #: its 95 % interval by bootstrap over runs
     channels: tuple[str, ...]  #: where it shows, the clearest first
-    z: float  #: its evidence, see :class:`terrain.discrepancy.selection.WaldTest`
+    z: float  #: its evidence, see :class:`terrain.discrepancy.evidence.WaldTest`
     dispersion: float  #: as there
     caveat: str = ""  #: what the values depend on, in words; empty where they are the same throughout
 

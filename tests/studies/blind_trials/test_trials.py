@@ -35,7 +35,7 @@ from studies.blind_trials.limits import POWER, TEST_SIZE, Limits, limits_of
 from studies.blind_trials.scoring import table_of
 from studies.blind_trials.trial import GROSS, run_trial, simulation_of, stage_of
 from terrain.discrepancy.diagnose import POWER_Z, diagnose
-from terrain.discrepancy.selection import Z_EFFECT
+from terrain.discrepancy.evidence import Z_EFFECT
 from terrain.discrepancy.verdict import Verdict
 from terrain.effects import BOUNDS, effect_named, library_of
 from terrain.errors import DataError

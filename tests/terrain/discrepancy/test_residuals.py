@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from terrain.discrepancy.compared import binned_means, noise_spectrum, run_means, spectrum
-from terrain.discrepancy.evidence import evidence_at, fit_change
+from terrain.discrepancy.evidence import evidence_at
 from terrain.discrepancy.noise import noise_of
 from terrain.discrepancy.runs import (
     SETTLE_S,
@@ -209,7 +209,7 @@ def test_noise_of_the_wheels_is_not_attributed_to_a_mass_or_a_motor():
         same = low_pass._replace(instrument_cutoff_hz=instrument_cutoff_hz)
         names = ["motor_constant_ratio", "rolling_resistance_ratio", "accel_bias_mps2"]
         info = evidence_at(signals, simulation, simulation.vector, names, same)
-        change, cov = fit_change(info, names)
+        change, cov = info.fit(names)
         off[instrument_cutoff_hz] = change[0], change[0] / np.sqrt(cov[0, 0])
     assert off[np.inf][1] < -4.0
     assert abs(off[low_pass.instrument_cutoff_hz][0]) < 0.5 * abs(off[np.inf][0])

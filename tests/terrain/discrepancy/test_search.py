@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 
 from terrain.discrepancy import search as search_module
-from terrain.discrepancy.evidence import Statistics, fit_change, move_point
+from terrain.discrepancy.evidence import Evidence, WaldTest
 from terrain.discrepancy.search import (
     RISE,
     RIVAL_LOSS,
     RIVAL_RISE,
-    Nearby,
-    Refit,
     cause_fit,
     names_of,
     pooled,
@@ -64,7 +62,7 @@ def test_three_causes_are_found_with_their_values_by_relinearisation(three):
     assert set(fit.tests) == names(problem.library)
     assert {name for name, test in fit.tests.items() if test.significant} == names(fit.causes)
     start = problem.at(problem.simulation.vector)
-    assert rivals_of(problem, fit.info, start, fit.causes) == {cause.name: () for cause in fit.causes}
+    assert rivals_of(problem, fit.info, start, fit.causes) == {cause.name: {} for cause in fit.causes}
 
 
 def test_changes_are_counted_from_the_simulation_that_was_given(three, posed, solve):
@@ -74,7 +72,7 @@ def test_changes_are_counted_from_the_simulation_that_was_given(three, posed, so
     whole = dict(zip(fit.names, zip(fit.change, np.sqrt(np.diag(fit.cov)), strict=True), strict=True))
     for name, change in zip(again.names, again.change, strict=True):
         assert change + half[name] == pytest.approx(whole[name][0], abs=whole[name][1])
-    np.testing.assert_allclose(fit_change(again.info, again.names)[0], again.change)
+    np.testing.assert_allclose(again.info.fit(again.names)[0], again.change)
 
 
 def test_a_set_of_causes_is_not_reached_twice(three, monkeypatch):
@@ -83,19 +81,21 @@ def test_a_set_of_causes_is_not_reached_twice(three, monkeypatch):
     first, second, third = (effect_named(name) for name in ("payload", "camera_yaw", "gyro_bias"))
     fitted = []
 
-    def refitted(problem, info, base, causes):
+    def refitted(problem, info, causes):
         fitted.append(names(causes))
         return fit.info
 
     def weakest(info, causes):
-        others = [i for i, cause in enumerate(causes) if cause is not first]
+        others = [cause for cause in causes if cause is not first]
         return others[0] if third in causes else None
 
     monkeypatch.setattr(search_module, "relinearize", refitted)
     monkeypatch.setattr(search_module, "_weakest", weakest)
-    in_turn = lambda info, base, causes, left, fit: [e for e in (first, second, third) if e in left][:1]  # noqa: E731
-    monkeypatch.setattr(search_module, "_next", in_turn)
-    monkeypatch.setattr(search_module, "_swap_for_better", lambda _, info, __, causes: (causes, info))
+    none = WaldTest(np.zeros(1), 0.0, 1.0, np.zeros(6), True)
+    monkeypatch.setattr(search_module, "wald_test", lambda *_: none)
+    in_turn = lambda info, names, left: [e for e in (first, second, third) if e in left][:1]  # noqa: E731
+    monkeypatch.setattr(search_module, "_pair", in_turn)
+    monkeypatch.setattr(search_module, "_swap_for_better", lambda _, info, causes: (causes, info))
     assert [cause.name for cause in search(problem, fit.info).causes] == ["payload", "camera_yaw"]
     with_third = {"payload", "camera_yaw", "gyro_bias"}
     assert fitted == [{"payload"}, {"payload", "camera_yaw"}, with_third, {"payload", "gyro_bias"}]
@@ -128,7 +128,7 @@ def test_what_is_hidden_is_found_from_where_straight_lines_mislead(posed, solve,
     inflation = [test.inflation for cause in fit.causes for test in [fit.tests[cause.name]]]
     assert (stds_off(fit, hidden, inflation) < 4).all()
     if hidden == {TRACK: -0.45}:
-        linear, _ = fit_change(problem.at(problem.simulation.vector), [TRACK])
+        linear, _ = problem.at(problem.simulation.vector).fit([TRACK])
         assert linear[0] < BOUNDS[TRACK][0]
 
 
@@ -138,23 +138,21 @@ class Bent:
     def near(self, info, vector, parameters):
         x = vector[INDEX[parameters[0]]] / 0.02
         slope, residual = 50.0 / (1 + x**2), -np.arctan(x)
-        return Nearby(
-            vector, np.array([[1e4 * slope**2]]), np.array([1e4 * slope * residual]), 1e4 * residual**2, ()
-        )
+        gram = 1e4 * np.outer([slope, residual], [slope, residual])
+        return Evidence(tuple(parameters), vector, vector, gram[None, None], {}, (), None, (), np.zeros(1))
 
 
 def test_a_step_that_raises_the_square_is_halved(monkeypatch):
-    bent, yaw, base = Bent(), ["camera_yaw_rad"], np.zeros(len(INDEX))
-    here = bent.near(None, move_point(base, yaw, np.array([0.05])), yaw)
-    total = here.a, here.g + here.a @ [0.05]
-    info = SimpleNamespace(origin=here.vector, origin_loss=here.c, total=lambda _: total)
-    points = list(steps_of(bent, info, base, yaw, 12))
-    losses = [here.c, *(point.c for point in points)]
+    bent, yaw = Bent(), ["camera_yaw_rad"]
+    here = bent.near(None, vector_of({"camera_yaw_rad": 0.05}), yaw)
+    info = here.counted_from(np.zeros(len(INDEX)))
+    points = list(steps_of(bent, info, yaw, 12))
+    losses = [here.c[0], *(point.c[0] for point in points)]
     assert all(after <= (1 + RISE) * before for before, after in pairwise(losses))
     assert points[-1].vector[INDEX["camera_yaw_rad"]] == pytest.approx(0.0, abs=1e-4)
     # without that guard it goes from bound to bound
     monkeypatch.setattr(search_module, "MAX_HALVINGS", 0)
-    free = list(steps_of(bent, info, base, yaw, 12))
+    free = list(steps_of(bent, info, yaw, 12))
     assert abs(free[-1].vector[INDEX["camera_yaw_rad"]]) == BOUNDS["camera_yaw_rad"][1]
 
 
@@ -164,10 +162,10 @@ def test_what_changes_other_channels_is_no_rival(posed, solve, monkeypatch):
     fit, start, payload = solve(problem), problem.at(problem.simulation.vector), effect_named("payload")
     assert names(fit.causes) == {"camera_yaw", "payload"}
     # as if the yaw had been withdrawn
-    assert rivals_of(problem, fit.info, start, [payload]) == {"payload": ()}
+    assert rivals_of(problem, fit.info, start, [payload]) == {"payload": {}}
     monkeypatch.setattr(search_module, "SHARED", -1.0)
     rivals = rivals_of(problem, fit.info, start, [payload])["payload"]
-    assert "camera_yaw" in [rival.effect.name for rival in rivals]
+    assert "camera_yaw" in rivals
 
 
 # -- Values that one simulation has for all runs: the least square over all of them ------------------------
@@ -184,7 +182,7 @@ def of_tracks(hide, pose):
             runs.append(replace(run, run_id=f"run_{i}"))
         problem = pose(runs, ["effective_track"])
         start = problem.at(problem.simulation.vector)
-        at = relinearize(problem, start, start.vector, problem.library)
+        at = relinearize(problem, start, problem.library)
         return problem, cause_fit(problem, at, problem.library)
 
     return fitted
@@ -193,10 +191,9 @@ def of_tracks(hide, pose):
 def test_it_leaves_the_least_square_where_runs_differ(of_tracks):
     problem, fit = of_tracks([0.3, 1.2, 0.4, 1.3, 0.5, 1.0])
     one = pooled(problem, fit)
-    statistics = Statistics(fit.info.noise, problem.simulation.scatter)
 
     def square(value):
-        info = problem.at(vector_of({TRACK: value}), (TRACK,), statistics)
+        info = problem.at(vector_of({TRACK: value}), (TRACK,), noise=fit.info.noise)
         return sum(float((white[-1] ** 2).sum()) for white in info.white)
 
     best = float(one.change[0])
@@ -226,16 +223,18 @@ def test_it_leaves_the_least_square_where_runs_differ(of_tracks):
 def test_an_effect_that_is_little_behind_is_a_rival(monkeypatch, behind, square, inflation, alike, is_rival):
     """The better of two judges counts: by one a cause that absorbs noise is ahead."""
     cause, other = effect_named("payload"), effect_named("motor_constant")
-    info, start = (SimpleNamespace(vector=(0.0,), model_std=np.zeros(1)) for _ in range(2))
+    info, start = (SimpleNamespace(vector=np.zeros(len(INDEX)), model_std=np.zeros(1)) for _ in range(2))
 
-    def fit(problem, judge, base, parameters):
-        own = parameters == names_of([cause])
+    def fit(problem, judge, parameters):
+        own, at = parameters == names_of([cause]), vector_of({"motor_constant_ratio": 0.1})
         loss = 0.0 if own else behind + 100.0 * (judge is start)
-        return Refit(loss, 1000.0 + square * (not own), np.array([0.1]), np.array([0.01]))
+        gram = np.diag([1e4, 1000.0 + square * (not own)])[None, None]
+        return loss, Evidence(tuple(parameters), at, at, gram, {}, (), None, (), np.zeros(1))
 
     monkeypatch.setattr(search_module, "replace", lambda *_, **__: None)
     monkeypatch.setattr(search_module, "fit_again", fit)
     monkeypatch.setattr(search_module, "_near", lambda *_: [(other, alike)])
     monkeypatch.setattr(search_module, "wald_test", lambda *_: SimpleNamespace(inflation=inflation))
     rivals = rivals_of(None, info, start, [cause])[cause.name]
-    assert [rival.effect.name for rival in rivals] == [other.name] * is_rival
+    assert list(rivals) == [other.name] * is_rival
+    assert all((change[0], std[0]) == pytest.approx((0.1, 0.01)) for change, std in rivals.values())

@@ -11,7 +11,6 @@ from terrain.discrepancy import diagnose
 from terrain.discrepancy.diagnose import (
     PROBE_ALIKE,
     PROBE_RATIO,
-    ChannelEffect,
     channel_effects,
     constancy_of_cause,
     raw_gain,
@@ -54,8 +53,8 @@ def test_a_right_cause_has_no_reason(yaw):
     assert cause.name == "camera_yaw"
     assert reason(problem, fit, probe_residuals(fit.info, fit.names, fit.change)) == ""
     effects = channel_effects(fit, cause)
-    assert effects["speed_y_mps"].with_cause < 0.5 * effects["speed_y_mps"].without
-    assert all(channel.with_cause < 1.05 * channel.without for channel in effects.values())
+    assert effects["speed_y_mps"][1] < 0.5 * effects["speed_y_mps"][0]
+    assert all(with_cause < 1.05 * without for without, with_cause, _ in effects.values())
     assert shown_channels(fit, cause)[0] == "speed_y_mps"
     assert not constancy_of_cause(fit, cause).varies
     # as if quick motion had asked for twice of it
@@ -127,7 +126,7 @@ def test_an_input_that_gains_much_beside_it_and_looks_like_it(yaw):
 def test_a_channel_that_it_makes_worse_and_a_main_channel_that_gains_nothing(
     yaw, monkeypatch, main, other, expected
 ):
-    given = {"speed_y_mps": ChannelEffect(*main), "current_a": ChannelEffect(*other)}
+    given = {"speed_y_mps": main, "current_a": other}
     monkeypatch.setattr(diagnose, "channel_effects", lambda *_: given)
     text = reason(*yaw)
     assert expected in text
@@ -137,22 +136,22 @@ def test_a_channel_that_it_makes_worse_and_a_main_channel_that_gains_nothing(
 def test_what_a_cause_does_to_each_channel(hide, pose):
     """A heading that turns 10 % less is taken for a track: the gyro, which is right, becomes worse by it."""
     sound = hide({}, scatter=ALIKE, heading=True)
-    statistics = pose(sound, ("effective_track",), STEADY).at(STEADY.vector).statistics
+    noise = pose(sound, ("effective_track",), STEADY).at(STEADY.vector).noise
     slower = [with_stream(run, "lidar", lambda heading: 0.9 * heading.values) for run in sound]
     problem = pose(slower, ("effective_track",), STEADY)
     (track,) = problem.library
-    fit = cause_fit(problem, problem.at(STEADY.vector, None, statistics), [track])
+    fit = cause_fit(problem, problem.at(STEADY.vector, noise=noise), [track])
     effects = channel_effects(fit, track)
     heading, gyro = effects["heading_rate_radps"], effects["yaw_rate_radps"]
-    assert heading.with_cause < 0.9 * heading.without
-    assert heading.held_out_gain > 0 > gyro.held_out_gain
-    assert gyro.with_cause > 1.1 * gyro.without
+    assert heading[1] < 0.9 * heading[0]
+    assert heading[2] > 0 > gyro[2]
+    assert gyro[1] > 1.1 * gyro[0]
     for name, channel in effects.items():  # by hand
         c, residuals = CHANNELS.index(name), [white[:, :, CHANNELS.index(name)] for white in fit.info.white]
         squares = [
             sum(((white[-1] - x * white[0]) ** 2).sum() for white in residuals) for x in (0.0, fit.change[0])
         ]
-        assert (channel.without, channel.with_cause) == pytest.approx(tuple(squares), rel=0.01), c
+        assert channel[:2] == pytest.approx(tuple(squares), rel=0.01), c
 
 
 def test_what_runs_deviate_by_themselves_is_not_free(hide, pose, solve):
@@ -162,5 +161,5 @@ def test_what_runs_deviate_by_themselves_is_not_free(hide, pose, solve):
     assert [cause.name for cause in fit.causes] == ["gyro_bias"]
     x, (a, g) = fit.change, fit.info.total(fit.names)
     effects = channel_effects(fit, fit.causes[0])
-    gained = sum(channel.without - channel.with_cause for channel in effects.values())
+    gained = sum(without - with_cause for without, with_cause, _ in effects.values())
     assert gained == pytest.approx(2 * g @ x - x @ a @ x, rel=1e-6)
