@@ -1,4 +1,4 @@
-"""Live by every filter and observer: the batch's numbers where it does not look ahead, and sense whatever comes."""
+"""Live by every filter and observer: the batch's numbers, late samples as those in time, sense whatever comes."""
 
 from dataclasses import replace
 from functools import cache
@@ -13,7 +13,7 @@ from terrain.estimation.clocks import QUEUE
 from terrain.estimation.estimate import estimate_run
 from terrain.estimation.feed import GNSS_ROWS, ROWS, measurement_table
 from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, FilterSettings, Noise, run_filter
-from terrain.estimation.live import CHANNELS, LiveFilter, LiveObserver
+from terrain.estimation.live import CHANNELS, REWIND_S, LiveFilter, LiveObserver
 from terrain.estimation.models.choice import OBSERVERS, make_observer
 from terrain.estimation.models.observer import CHANNELS as OBSERVED
 from terrain.estimation.models.observer import observe, rows_of
@@ -21,7 +21,6 @@ from terrain.estimation.models.skid import Motion, stuck_intervals
 from terrain.estimation.models.slip_model import SlipModel
 from terrain.estimation.models.swerve import default_noise, make_filter, scheduled
 from terrain.estimation.wheel_slip import wheel_slip
-from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.replay import replay
 from terrain.records import Reading, Stream
@@ -50,9 +49,8 @@ MIDDLE_S = 8.0
 
 
 @cache
-def log(scenario="straight", duration_s=16.0, gnss=False, lost=(), seed=3):
-    faults = Faults(camera_lost_s=lost)
-    sensors = {"faults": faults, "gnss": Gnss() if gnss else None}
+def log(scenario="straight", duration_s=16.0, gnss=False, seed=3, faults=None):
+    sensors = {"faults": faults or Faults(), "gnss": Gnss() if gnss else None}
     return simulate_run(ROBOT, "grass", scenario, seed, duration_s=duration_s, **sensors)
 
 
@@ -106,8 +104,7 @@ def batch(run, robot=ROBOT, name="vio15", yaw=None):
     if name == "skid":
         found = estimate_run(run, robot, "skid")
         track, table = found.track, found.table
-        stuck = np.isfinite(np.where(found.motion == Motion.STUCK, 0.0, np.nan))
-        desired = {"speed_x_mps": track.state("speed_mps"), "motion": found.motion, "is_stuck": stuck}
+        desired = {"speed_x_mps": track.state("speed_mps"), "motion": found.motion}
     else:
         table = measurement_table(run, robot, causal=True, initial_yaw_rad=yaw or 0.0)
         model, noise = make_filter(name, robot, yaw is not None), default_noise(name, robot, yaw is not None)
@@ -120,12 +117,12 @@ def batch(run, robot=ROBOT, name="vio15", yaw=None):
         track = run_filter(model, noise, table.time_s, table.columns(model.rows), gates, inputs)
         table = table.at(track.time_s)
         slip = wheel_slip(track, table, robot)
-        desired = {name: track.state(name) for name in ("speed_x_mps", "accel_y_mps2")}
+        desired = {name: track.state(name) for name in ("speed_x_mps", "accel_y_mps2", "yaw_rate_radps")}
         desired |= {"slip_ratio": slip.slip_ratio, "slip_std": slip.slip_std, "slip_stale": slip.stale}
-    rows = [row for row in table.rows if row not in GNSS_ROWS or yaw is not None]
-    desired |= {"rows": table.columns(rows), "mean": track.mean, "reference_age_s": track.reference_age_s}
+    known = [row for row in table.rows if row not in GNSS_ROWS or yaw is not None]
+    desired |= dict(zip(known, table.columns(known).T, strict=True))
+    desired |= {"mean": track.mean, "reference_age_s": track.reference_age_s}
     desired |= {"std": np.column_stack([track.std(state) for state in track.states])}
-    desired |= {"yaw_rate_radps": track.state("yaw_rate_radps")}
     return track.time_s, desired, {**table.dropped, **track.dropped}
 
 
@@ -136,21 +133,18 @@ def assert_equal(run, robot=ROBOT, name="vio15", yaw=None, **options):
     time_s, desired, dropped = batch(run, robot, name, yaw)
     np.testing.assert_array_equal(column(estimates, "time_s"), time_s)
     for what, expected in desired.items():
-        if what == "is_stuck":
-            found = np.isfinite(column(estimates, "stuck_since_s"))
-        elif what == "rows":
-            known = {"swerve": ROWS[:-3], "skid_steer": ("wheel_left_mps", "wheel_right_mps", "gyro_z_radps")}
-            names = [*known[robot.drive], *(GNSS_ROWS if robot.drive == "skid_steer" else ())]
-            names += ["rest_gyro_radps"] if robot.drive == "skid_steer" else []
-            names = [row for row in names if row not in GNSS_ROWS or yaw is not None]
-            found = column(estimates, "rows")[:, [ROWS.index(row) for row in names]]
+        if what in ROWS:
+            found = column(estimates, "rows")[:, ROWS.index(what)]
         else:
             found = column(estimates, what)
         close = {"swerve": 1e-9, "skid_steer": 1e-12}.get(robot.drive, 0.0)
         np.testing.assert_allclose(found, expected, rtol=0, atol=close, err_msg=what)
-    lookahead = ["clock", "time", "stamp"]
     counted, expected = (
-        {kind: n for kind, n in counts.items() if not any(word in kind for word in lookahead)}
+        {
+            kind: n
+            for kind, n in counts.items()
+            if not any(word in kind for word in ("clock", "time", "stamp"))
+        }
         for counts in (estimator.dropped, dropped)
     )
     assert counted == expected
@@ -188,37 +182,38 @@ def test_a_skid_steer_robot_live_equals_batch(scenario, soil, seed):
     assert_equal(skid_log(scenario, seed, soil), HUSKY, "skid")
 
 
-@pytest.mark.parametrize("name", ["tracked", "slip-learning", "gyrodometry"])
-def test_an_observer_live_equals_batch(name):
-    assert_equal(tracked_log(), UGV, name)
-
-
-def test_live_equals_batch_where_the_robot_is_stuck():
-    """The gyro of a robot that stands, on wheels that turn it on the spot."""
-    run = skid_log()
-    wheels, imu = run.streams["wheels"], run.streams["imu"]
-    spins = (wheels.time_s > 8.0) & (wheels.time_s < 16.0)
-    sides = [wheels.channels.index(f"speed_{side}_mps") for side in ("left", "right")]
-    values, angular = np.array(wheels.values), np.array(imu.values)
-    values[np.ix_(spins, sides)] = [-0.2, 0.2]
-    still = (imu.time_s > 7.9) & (imu.time_s < 16.1)
-    angular[still, imu.channels.index("gyro_z_radps")] = np.random.default_rng(2).normal(0, 0.01, still.sum())
-    streams = {
-        "wheels": Stream(wheels.time_s, values, wheels.channels),
-        "imu": Stream(imu.time_s, angular, imu.channels),
-    }
-    estimates = assert_equal(replace(run, streams=streams), HUSKY, "skid")
-    (interval,) = stuck_intervals(column(estimates, "time_s"), column(estimates, "motion"))
-    assert 8.0 <= interval.start_s < 11.0
-    assert interval.end_s == pytest.approx(16.0, abs=0.6)
-    since_s = column(estimates, "stuck_since_s")
-    assert set(since_s[np.isfinite(since_s)].tolist()) == {interval.start_s}
+@pytest.mark.parametrize(
+    ("name", "replay_hz"), [("tracked", 50.0), ("slip-learning", 7.3), ("gyrodometry", 3.1)]
+)
+def test_an_observer_live_equals_batch_whatever_comes_together(name, replay_hz):
+    assert_equal(tracked_log(), UGV, name, replay_hz=replay_hz)
 
 
 def edited(run, name, edit):
     stream = run.streams[name]
     time_s, values = edit(np.array(stream.time_s), np.array(stream.values))
     return replace(run, streams={**run.streams, name: Stream(time_s, values, stream.channels)})
+
+
+def test_live_equals_batch_where_the_robot_is_stuck():
+    """The gyro of a robot that stands, on wheels that turn it on the spot."""
+
+    def spins(time_s, values):
+        values[(time_s > 8.0) & (time_s < 16.0), :2] = [-0.2, 0.2]
+        return time_s, values
+
+    def stands(time_s, values):
+        still = (time_s > 7.9) & (time_s < 16.1)
+        values[still, 2] = np.random.default_rng(2).normal(0, 0.01, still.sum())
+        return time_s, values
+
+    estimates = assert_equal(edited(edited(skid_log(), "wheels", spins), "imu", stands), HUSKY, "skid")
+    motion, since_s = column(estimates, "motion"), column(estimates, "stuck_since_s")
+    (interval,) = stuck_intervals(column(estimates, "time_s"), motion)
+    assert 8.0 <= interval.start_s < 11.0
+    assert interval.end_s == pytest.approx(16.0, abs=0.6)
+    assert (since_s[motion == Motion.STUCK] == interval.start_s).all()
+    assert np.isnan(since_s[motion != Motion.STUCK]).all()
 
 
 def put(value, n=30, channel=slice(None)):
@@ -314,17 +309,6 @@ def test_a_clock_that_is_set_back_is_believed_when_the_next_stamp_follows():
         desired = known[round(estimate.time_s, 6)]
         assert not estimate.slip_stale
         np.testing.assert_allclose(estimate.slip_ratio, desired.slip_ratio, atol=0.01)
-
-
-def test_the_queue_of_samples_ahead_of_the_wheels_is_bounded():
-    estimator = LiveFilter(ROBOT)
-    rng = np.random.default_rng(0)
-    for k in range(40):
-        time_s = k + np.arange(200) / 200.0
-        estimator.step({"odometry": Reading(time_s, rng.standard_normal((200, len(CAMERA_CHANNELS))))})
-    assert estimator.dropped["odometry: waited too long"] >= 8000 - QUEUE
-    wheels = Reading(np.array([40.0]), np.zeros((1, 6)))
-    assert len(settled(estimator, [{"wheels": wheels}])) == 1
 
 
 KINDS = {
@@ -549,3 +533,179 @@ def test_a_jump_of_any_length_costs_live_what_it_costs_the_batch(n, stamps):
 def test_a_gap_of_whole_periods_costs_live_what_it_costs_the_batch(n, stream):
     rate_hz = {"imu": 100.0, "odometry": 200.0, "steering": 50.0}[stream]
     assert_equal(edited(edited(log(), stream, stamped(rate_hz, "decimal")), stream, lost(n)))
+
+
+def test_samples_that_wait_for_the_wheels_are_bounded():
+    for kind, (robot, _, _) in KINDS.items():
+        estimator, n_columns = made(kind), len(channels_of(kind)["imu"])
+        for k in range(40):
+            estimator.step({"imu": Reading(k + np.arange(200) / 200.0, np.full((200, n_columns), 0.1))})
+        assert estimator.dropped["imu: waited too long"] >= 8000 - QUEUE
+        assert len(settled(estimator, [{"wheels": wheels_of(kind, 40.0)}])) == 1, robot
+
+
+@pytest.mark.parametrize("kind", ["skid filter", "observer"])
+def test_a_clock_that_is_set_back_begins_anew_and_one_stamp_far_ahead_is_left_behind(kind):
+    n_columns = len(channels_of(kind)["imu"])
+    for back_s, ahead_s in ((3600.0, 0.0), (0.0, 1e9)):
+        estimator, found = made(kind), []
+        for k, time_s in enumerate(np.arange(0.0, 4.0, 0.02)):
+            stamp_s = time_s - back_s * (k >= 100) + ahead_s * (k == 100)
+            imu = Reading(np.array([stamp_s]), np.full((1, n_columns), 0.1))
+            found += estimator.step({"imu": imu, "wheels": wheels_of(kind, stamp_s)})
+        found += estimator.settle(all_of_them=True)
+        assert len(found) > 180
+        assert sum(n for what, n in estimator.dropped.items() if "clock" in what) >= 1
+        for estimate in found:
+            assert_sound(estimate, kind)
+
+
+# -- samples that come late
+
+STREAMS, OBSERVED_STREAMS = ("wheels", "steering", "imu", "odometry"), ("wheels", "imu", "gnss", "compass")
+PERIOD_S = 0.02
+FIRST, N_MIXED, N_AFTER = 60, 25, 15
+"""Steps before samples come late, with late ones, and after them."""
+
+MOST_STEPS = 11
+"""By so many steps a sample may be late: of 0.25 s, less a step and a period of the wheels."""
+
+
+@cache
+def in_order(robot=ROBOT):
+    """Return time and readings of each step; of the IMU a sample that may come late is not finite."""
+    run = log(duration_s=6.0, seed=5, faults=Faults(by_chance=False)) if robot is ROBOT else tracked_log()
+    values = np.array(run.streams["imu"].values)
+    values[np.searchsorted(run.streams["imu"].time_s, (FIRST + 5) * PERIOD_S), 3] = np.nan
+    imu = Stream(run.streams["imu"].time_s, values, run.streams["imu"].channels)
+    names = STREAMS if robot is ROBOT else OBSERVED_STREAMS
+    streams = {name: run.streams[name] for name in names} | {"imu": imu}
+    return [(sample.time_s, sample.readings) for sample in replay(replace(run, streams=streams))]
+
+
+def drive(steps, now=False, robot=ROBOT, name="vio15"):
+    """Return an estimator that was given readings step by step, and the time of each where `now` says so."""
+    run = LOGS[robot.name]()
+    names = STREAMS if robot is ROBOT else OBSERVED_STREAMS
+    estimator = estimator_of(robot, name, {stream: run.streams[stream].channels for stream in names})
+    for time_s, readings in steps:
+        estimator.step(readings, time_s if now else None)
+    return estimator
+
+
+@cache
+def undelayed(now=False, robot=ROBOT, name="vio15"):
+    return drive(in_order(robot)[: FIRST + N_MIXED + N_AFTER], now, robot, name)
+
+
+def delayed(delays_of, robot=ROBOT):
+    """Return steps whose readings come later, by stream a number of steps for each of the mixed ones.
+
+    What is late of the wheels keeps its order: the next sample comes no earlier.
+    """
+    steps, wheels_at = in_order(robot)[: FIRST + N_MIXED + N_AFTER], 0
+    arrivals = [{} for _ in steps]
+    for k, (_, readings) in enumerate(steps):
+        for name, reading in readings.items():
+            is_mixed = name in delays_of and 0 <= k - FIRST < N_MIXED
+            at = k + delays_of[name][k - FIRST] if is_mixed else k
+            if name == "wheels":
+                at = wheels_at = max(at, wheels_at)
+            arrivals[at].setdefault(name, []).append(reading)
+    return [
+        (
+            time_s,
+            {name: Reading(*map(np.concatenate, zip(*came, strict=True))) for name, came in each.items()},
+        )
+        for (time_s, _), each in zip(steps, arrivals, strict=True)
+    ]
+
+
+def assert_same(estimator, expected):
+    for one, other in zip(estimator.latest, expected.latest, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert estimator.health == expected.health
+    counts, expected_counts = (
+        {kind: n for kind, n in one.dropped.items() if kind not in ("came late", "ticks without wheels")}
+        for one in (estimator, expected)
+    )
+    assert counts == expected_counts
+    if isinstance(estimator, LiveFilter):
+        for one, other in zip(estimator._snapshot(), expected._snapshot(), strict=True):
+            assert one.tobytes() == other.tobytes()
+
+
+delays = st.lists(st.integers(0, MOST_STEPS), min_size=N_MIXED, max_size=N_MIXED)
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.dictionaries(st.sampled_from(STREAMS), delays, min_size=1), st.booleans())
+def test_late_samples_give_the_numbers_of_samples_in_time(delays_of, now):
+    """Ticks without wheels, which were done for want of them, leave nothing behind."""
+    assert_same(drive(delayed(delays_of), now), undelayed(now))
+
+
+@pytest.mark.parametrize("name", ["tracked", "slip-learning", "gyrodometry"])
+def test_an_observer_takes_late_samples_as_those_in_time(name):
+    for seed in range(4):
+        most = (1, MOST_STEPS)[
+            seed % 2
+        ]  # of one step: fixes are stamped as the tick before, but for how they round
+        drawn = np.random.default_rng(seed).integers(0, most + 1, (3, N_MIXED)).tolist()
+        delays_of = dict(zip(OBSERVED_STREAMS[1 : 4 - seed // 2], drawn, strict=False))
+        assert_same(drive(delayed(delays_of, UGV), False, UGV, name), undelayed(False, UGV, name))
+
+
+@pytest.mark.parametrize("name", STREAMS)
+def test_what_comes_later_than_the_reach_is_counted_and_changes_nothing(name):
+    """Three readings that come 0.3 s late, or never."""
+    n_late, steps = int(REWIND_S / PERIOD_S) + 3, in_order()[: FIRST + N_MIXED + N_AFTER]
+    without = [
+        (time_s, {other: r for other, r in readings.items() if other != name or not 0 <= k - FIRST < 3})
+        for k, (time_s, readings) in enumerate(steps)
+    ]
+    never, late, n_samples = drive(without), drive(()), 0
+    for k, (_, readings) in enumerate(without):
+        if 0 <= k - n_late - FIRST < 3:
+            before, too_late = late.latest, steps[k - n_late][1][name]
+            assert late.step({name: too_late}) == []
+            assert late.latest is before
+            n_samples += too_late.time_s.size
+        late.step(readings)
+    kind = "time did not advance" if name == "wheels" else f"{name}: stamp does not increase"
+    assert late.dropped[kind] - never.dropped.get(kind, 0) == n_samples >= 3
+    for one, other in zip(late.latest, never.latest, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_without_wheels_ticks_go_on_by_the_callers_time_and_uncertainty_grows():
+    estimator, times_s, stds = drive(()), [], []
+    for time_s, readings in in_order():
+        estimator.step({n: r for n, r in readings.items() if n != "wheels" or time_s <= 2.0}, time_s)
+        if estimator.latest is not None:
+            times_s.append(estimator.latest.time_s)
+            stds.append(estimator.latest.std[estimator.states.index("slip_speed_1_mps")])
+    times_s, stds = np.array(times_s), np.array(stds)
+    gone = times_s > 2.03
+    assert np.diff(times_s[gone]).max() < 2.1 * PERIOD_S
+    assert in_order()[-1][0] - times_s[-1] < 2.0 * PERIOD_S
+    assert estimator.dropped["ticks without wheels"] == len(set(times_s[gone]))
+    assert stds[-1] > 2.0 * stds[~gone][-1]
+    assert np.isnan(estimator.latest.motor_radps).all()
+
+
+def test_a_stamp_far_ahead_does_not_end_the_wait_for_its_stream():
+    """The IMU's stamps are an hour ahead once; later, its samples come three steps after the wheels'."""
+    (estimator, found), (expected, in_time) = (drive(()), []), (drive(()), [])
+    late = delayed({"imu": [3] * N_MIXED})
+    for k, ((_, readings), (_, others)) in enumerate(zip(late, in_order(), strict=False)):
+        if k == FIRST - 10:
+            imu = Reading(readings["imu"].time_s + 3600.0, readings["imu"].values)
+            readings, others = {**readings, "imu": imu}, {n: r for n, r in others.items() if n != "imu"}
+        found += estimator.step(readings)
+        in_time += expected.step(others)
+    means = {estimate.time_s: estimate.mean for estimate in in_time}
+    assert len(found) > FIRST + N_MIXED - 5
+    assert (np.diff([estimate.time_s for estimate in found]) > 0.0).all()
+    for estimate in found[: FIRST + N_MIXED - 5]:  # after that the last late ones come out of order
+        np.testing.assert_array_equal(estimate.mean, means[estimate.time_s])

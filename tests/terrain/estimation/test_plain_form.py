@@ -8,48 +8,8 @@ import pytest
 
 from terrain.angles import unwrapped, wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.estimation.feed import (
-    BELIEVED_S,
-    CAMERA_ROWS,
-    CHANGE_S,
-    CRAWL_MPS,
-    DERIVED_ROWS,
-    FIRST_CAMERA,
-    FIRST_SPEED,
-    FIRST_WHEEL,
-    FIX_STD_M,
-    FLOAT_STD_M,
-    GAP_PERIODS,
-    GNSS_LATENCY_S,
-    GNSS_ROWS,
-    GNSS_SPEED_STD_MPS,
-    HELD_S,
-    LATCHED,
-    LATE_S,
-    MAX_AGE_PERIODS,
-    MAX_RATE_FACTOR,
-    MIN_CONFIDENCE_RATIO,
-    MOVING_MPS,
-    PASSING,
-    REPEATED,
-    REST_ACCEL_MPS2,
-    REST_AFTER_S,
-    REST_SEEN_MPS,
-    REST_TURN_RADPS,
-    REST_WHEEL_MPS,
-    RIPPLE_MPS,
-    ROWS_OF_DRIVE,
-    SAME,
-    SIGNALS,
-    STANDING_S,
-    STANDING_SPEED_MPS,
-    TICK_S,
-    UNSEEN_AFTER_S,
-    VIBRATION_S,
-    WAVERING_MPS,
-    clean_streams,
-    measurement_table,
-)
+from terrain.estimation import feed
+from terrain.estimation.feed import clean_streams, measurement_table
 from terrain.kinematics.camera import body_motion
 from terrain.records import Stream
 from terrain.robots import load_robot
@@ -71,16 +31,16 @@ ODD = ROBOT.with_parts(
 )
 
 
-def plain_jumps(time_s, value, least, per_second, fate=PASSING):
-    """Mark samples that are further from the last one kept than a robot gets, for at most BELIEVED_S."""
-    if fate != PASSING:
+def plain_jumps(time_s, value, least, per_second, fate=feed.PASSING):
+    """Mark samples that are further from the last one kept than a robot gets, for at most feed.BELIEVED_S."""
+    if fate != feed.PASSING:
         return plain_sums(time_s, value, least, per_second, fate) != 0.0
     jumps = np.zeros(value.size, dtype=bool)
     last, last_s, since_s = np.nan, np.nan, np.nan
     for k in np.flatnonzero(np.isfinite(value)):
         if abs(value[k] - last) > least + per_second * (time_s[k] - last_s):
             since_s = time_s[k] if np.isnan(since_s) else since_s
-            if time_s[k] - since_s < BELIEVED_S:
+            if time_s[k] - since_s < feed.BELIEVED_S:
                 jumps[k] = True
                 continue
         last, last_s, since_s = value[k], time_s[k], np.nan
@@ -93,11 +53,11 @@ def plain_sums(time_s, value, least, per_second, fate, period_s=None):
     A jump from the first sample after a gap is that one's fault.
     """
     known = np.flatnonzero(np.isfinite(value))
-    gap_s = GAP_PERIODS * (np.median(np.diff(time_s)) if period_s is None else period_s)
+    gap_s = feed.GAP_PERIODS * (np.median(np.diff(time_s)) if period_s is None else period_s)
     sums, total, followed = np.zeros(value.size), 0.0, False
     for before, k in pairwise(known):
         step_s, change = time_s[k] - time_s[before], value[k] - value[before]
-        if fate == LATCHED and step_s > gap_s:
+        if fate == feed.LATCHED and step_s > gap_s:
             total, followed = 0.0, False
             continue
         if followed and abs(change) > least + per_second * step_s:
@@ -111,7 +71,7 @@ def plain_frozen(value, most, moving):
     frozen = np.zeros(value.size, dtype=bool)
     count, longest, began, last = 0, 0, False, np.nan
     for k in np.flatnonzero(np.isfinite(value)):
-        if abs(value[k] - last) <= SAME:
+        if abs(value[k] - last) <= feed.SAME:
             count += 1
         else:
             longest = max(longest, count) if moving[k] and began else longest
@@ -134,13 +94,15 @@ def plain_moving(clock, wheel_speed_mps):
             elif np.isnan(speed):
                 once[n, i], twice[n, i] = before, twice[n - 1, i]
             else:
-                keep = np.exp(-step_s / CHANGE_S)
+                keep = np.exp(-step_s / feed.CHANGE_S)
                 twice[n, i] = before + (twice[n - 1, i] - before) * keep
                 once[n, i] = speed + (before - speed) * keep
 
     def moving(came_s):
-        last = np.searchsorted(clock + TICK_S, came_s) - 1  # the tick that was done when a sample came
-        return np.array([n >= 0 and bool((np.abs(once[n]) > MOVING_MPS).any()) for n in last], dtype=bool)
+        last = np.searchsorted(clock + feed.TICK_S, came_s) - 1  # the tick that was done when a sample came
+        return np.array(
+            [n >= 0 and bool((np.abs(once[n]) > feed.MOVING_MPS).any()) for n in last], dtype=bool
+        )
 
     return once, twice, moving
 
@@ -148,11 +110,11 @@ def plain_moving(clock, wheel_speed_mps):
 def plain_derived(clock, table, once, twice, imu_s, accel_z, robot):
     """Return the rows that follow from others, tick by tick."""
     n = clock.size
-    rows = {row: np.full(n, np.nan) for row in DERIVED_ROWS}
+    rows = {row: np.full(n, np.nan) for row in feed.DERIVED_ROWS}
     square = np.full(imu_s.size, np.nan)
     for k in np.flatnonzero(np.isfinite(accel_z)):
         before = np.flatnonzero(np.isfinite(square[:k]))
-        keep = np.exp(-(imu_s[k] - imu_s[before[-1]]) / VIBRATION_S) if before.size else 0.0
+        keep = np.exp(-(imu_s[k] - imu_s[before[-1]]) / feed.VIBRATION_S) if before.size else 0.0
         square[k] = accel_z[k] ** 2 + ((square[before[-1]] - accel_z[k] ** 2) * keep if before.size else 0.0)
     speeds = np.column_stack([table[f"wheel_{i}_radps"] for i in (1, 2, 3)]) * robot.wheel_radius_m
     still_since, seen_s, changes = np.nan, np.nan, np.full((n, 3), np.nan)
@@ -160,27 +122,29 @@ def plain_derived(clock, table, once, twice, imu_s, accel_z, robot):
         for i in range(3):
             slow, slower = (once[k - 1, i], twice[k - 1, i]) if k else (np.nan, np.nan)
             rise = slow - slower
-            change = slower * np.sign(rise) * max(abs(rise) - WAVERING_MPS, 0.0) / CHANGE_S
-            rows[f"wheel_{i + 1}_growth_per_s"][k] = change / (slower**2 + CRAWL_MPS**2)
-            ahead = max(abs(speeds[k, i] - slow) - RIPPLE_MPS, 0.0) if slow == slow else np.nan
-            changes[k, i] = (abs(speeds[k, i]) + CRAWL_MPS) * ahead / CHANGE_S
+            change = slower * np.sign(rise) * max(abs(rise) - feed.WAVERING_MPS, 0.0) / feed.CHANGE_S
+            rows[f"wheel_{i + 1}_growth_per_s"][k] = change / (slower**2 + feed.CRAWL_MPS**2)
+            ahead = max(abs(speeds[k, i] - slow) - feed.RIPPLE_MPS, 0.0) if slow == slow else np.nan
+            changes[k, i] = (abs(speeds[k, i]) + feed.CRAWL_MPS) * ahead / feed.CHANGE_S
             rows[f"wheel_{i + 1}_change_m2ps3"][k] = changes[k, i]
         seen_s = clock[k] if np.isfinite(table["camera_speed_x_mps"][k]) else seen_s
         rows["camera_age_s"][k] = clock[k] - seen_s
-        if not clock[k] - seen_s <= UNSEEN_AFTER_S:
+        if not clock[k] - seen_s <= feed.UNSEEN_AFTER_S:
             for i in range(3):
-                left = changes[: k + 1, i] * np.exp(-(clock[k] - clock[: k + 1]) / HELD_S)
+                left = changes[: k + 1, i] * np.exp(-(clock[k] - clock[: k + 1]) / feed.HELD_S)
                 rows[f"wheel_{i + 1}_change_m2ps3"][k] = (
                     np.nanmax(left) if np.isfinite(left).any() else np.nan
                 )
-        still = k > 0 and (np.abs(twice[k - 1]) <= REST_WHEEL_MPS).all()
-        still &= (np.abs(speeds[k]) <= MOVING_MPS).all() and abs(table["gyro_z_radps"][k]) <= REST_TURN_RADPS
+        still = k > 0 and (np.abs(twice[k - 1]) <= feed.REST_WHEEL_MPS).all()
+        still &= (np.abs(speeds[k]) <= feed.MOVING_MPS).all() and abs(
+            table["gyro_z_radps"][k]
+        ) <= feed.REST_TURN_RADPS
         for axis in "xy":
-            still &= abs(table[f"accel_{axis}_mps2"][k]) <= REST_ACCEL_MPS2
-            still &= not abs(table[f"camera_speed_{axis}_mps"][k]) > REST_SEEN_MPS
+            still &= abs(table[f"accel_{axis}_mps2"][k]) <= feed.REST_ACCEL_MPS2
+            still &= not abs(table[f"camera_speed_{axis}_mps"][k]) > feed.REST_SEEN_MPS
         still_since = (still_since if still_since == still_since else clock[k]) if still else np.nan
-        if clock[k] - still_since >= REST_AFTER_S:
-            for row in DERIVED_ROWS[-3:]:
+        if clock[k] - still_since >= feed.REST_AFTER_S:
+            for row in feed.DERIVED_ROWS[-3:]:
                 rows[row][k] = 0.0
     return rows, square
 
@@ -198,11 +162,11 @@ def plain_low_pass(time_s, value, tau_s, gap_s):
 def plain_held(clock, time_s, period_s):
     """Return which sample each tick takes: the last at or before it, or -1 where that is too old."""
     tick_s = np.median(np.diff(clock))
-    held = np.searchsorted(time_s, clock + TICK_S, side="right") - 1
+    held = np.searchsorted(time_s, clock + feed.TICK_S, side="right") - 1
     taken = held >= 0
     age_s = clock[taken] - time_s[held[taken]]
-    taken[taken] = age_s <= MAX_AGE_PERIODS * max(period_s, tick_s) + TICK_S
-    if period_s > MAX_AGE_PERIODS * tick_s:
+    taken[taken] = age_s <= feed.MAX_AGE_PERIODS * max(period_s, tick_s) + feed.TICK_S
+    if period_s > feed.MAX_AGE_PERIODS * tick_s:
         taken[1:] &= held[1:] != held[:-1]
     return np.where(taken, held, -1)
 
@@ -211,7 +175,7 @@ def plain_on_clock(clock, time_s, came_s, signal, tau_s):
     known, period_s = np.isfinite(signal), np.median(np.diff(time_s))
     held = plain_held(clock, came_s[known], period_s)
     taken, out = held[held >= 0], np.full(clock.size, np.nan)
-    behind = plain_low_pass(time_s[known], signal[known], tau_s, GAP_PERIODS * period_s) - signal[known]
+    behind = plain_low_pass(time_s[known], signal[known], tau_s, feed.GAP_PERIODS * period_s) - signal[known]
     decay = np.exp((time_s[known][taken] - clock[held >= 0]) / tau_s) if tau_s > 0 else 1.0
     out[held >= 0] = signal[known][taken] + behind[taken] * decay
     return out
@@ -237,7 +201,7 @@ def plain_steering(steering, robot):
 
 def plain_camera(odometry, robot):
     seen = body_motion(odometry, robot.camera)
-    return dict(zip(CAMERA_ROWS, (*seen.speed_mps.T, seen.yaw_rate_radps, seen.yaw_rad), strict=True))
+    return dict(zip(feed.CAMERA_ROWS, (*seen.speed_mps.T, seen.yaw_rate_radps, seen.yaw_rad), strict=True))
 
 
 def plain_gnss(gnss, causal):
@@ -247,15 +211,19 @@ def plain_gnss(gnss, causal):
     fixed, known = gnss.channel("fix_ratio") >= 0.5, np.isfinite(values[:, 0])
     values[:, :2] -= values[(known & fixed if (known & fixed).any() and not causal else known).argmax(), :2]
     std = gnss.channel("std_position_m")
-    std = np.where(std > 0, std, np.where(fixed, FIX_STD_M, FLOAT_STD_M))
-    variance = np.column_stack([std, std, *[np.full(std.size, GNSS_SPEED_STD_MPS)] * 2]) ** 2
+    std = np.where(std > 0, std, np.where(fixed, feed.FIX_STD_M, feed.FLOAT_STD_M))
+    variance = np.column_stack([std, std, *[np.full(std.size, feed.GNSS_SPEED_STD_MPS)] * 2]) ** 2
     variance[np.isnan(values)] = np.nan
-    return dict(zip(GNSS_ROWS, values.T, strict=True)), dict(zip(GNSS_ROWS, variance.T, strict=True))
+    return dict(zip(feed.GNSS_ROWS, values.T, strict=True)), dict(
+        zip(feed.GNSS_ROWS, variance.T, strict=True)
+    )
 
 
 def plain_yaw(table, clock, wheel_speed_mps, initial_yaw_rad, causal):
     """Count the yaw rows from the start, and keep the camera's on the turn that the IMU is on."""
-    moving = (np.abs(wheel_speed_mps) > STANDING_SPEED_MPS).any(axis=1) | (clock > clock[0] + STANDING_S)
+    moving = (np.abs(wheel_speed_mps) > feed.STANDING_SPEED_MPS).any(axis=1) | (
+        clock > clock[0] + feed.STANDING_S
+    )
     standing = ~np.logical_or.accumulate(moving)
     for row in ("imu_yaw_rad", "camera_yaw_rad"):
         known = np.isfinite(table[row])
@@ -266,7 +234,7 @@ def plain_yaw(table, clock, wheel_speed_mps, initial_yaw_rad, causal):
         table[row] = table[row] - mean + initial_yaw_rad
     imu, camera = table["imu_yaw_rad"], table["camera_yaw_rad"]
     both, start = np.isfinite(imu) & np.isfinite(camera), int(np.isfinite(camera).argmax())
-    if both[start] and clock[start] > clock[0] + LATE_S:
+    if both[start] and clock[start] > clock[0] + feed.LATE_S:
         camera = camera + imu[start] - initial_yaw_rad
     table["camera_yaw_rad"] = camera + 2 * np.pi * np.round(np.where(both, imu - camera, 0.0) / (2 * np.pi))
 
@@ -276,25 +244,25 @@ def plain_table(run, robot, causal, initial_yaw_rad):
     streams, lag_s = clean_streams(run, robot)[0], robot.sensors.encoder_time_constant_s
     wheels = streams["wheels"]
     clock, rates = wheels.time_s, wheels.values / robot.motors.reduction_ratio
-    rates = np.where(np.abs(rates) > MAX_RATE_FACTOR * robot.motors.speed_max_radps, np.nan, rates)
-    rows = ROWS_OF_DRIVE["swerve"]
+    rates = np.where(np.abs(rates) > feed.MAX_RATE_FACTOR * robot.motors.speed_max_radps, np.nan, rates)
+    rows = feed.ROWS_OF_DRIVE["swerve"]
     rates = plain_wheels(clock, wheels.values, rates, robot)
     once, twice, moving = plain_moving(clock, rates * robot.wheel_radius_m)
     table, jumps = dict(zip(rows, rates.T, strict=False)), {}
     imu_s, accel_z = np.zeros(0), np.zeros(0)
     camera_lag_s = max(lag_s - robot.camera.time_constant_s, 0.0)
-    gnss_variance = dict.fromkeys(GNSS_ROWS, np.full(clock.size, np.nan))
+    gnss_variance = dict.fromkeys(feed.GNSS_ROWS, np.full(clock.size, np.nan))
     for name, latency_s, tau_s in (
         ("imu", robot.sensors.imu_latency_s, lag_s),
         ("steering", 0.0, lag_s),
         ("odometry", robot.camera.latency_s, camera_lag_s),
-        ("gnss", GNSS_LATENCY_S, lag_s),
+        ("gnss", feed.GNSS_LATENCY_S, lag_s),
     ):
         if name not in streams:
             continue
         stream = streams[name]
         if name == "odometry":
-            sees = ~(stream.channel("confidence_ratio") < MIN_CONFIDENCE_RATIO)
+            sees = ~(stream.channel("confidence_ratio") < feed.MIN_CONFIDENCE_RATIO)
             stream = Stream(stream.time_s[sees], stream.values[sees], stream.channels)
         time_s = stream.time_s - latency_s
         came_s = stream.time_s if causal else time_s
@@ -310,14 +278,16 @@ def plain_table(run, robot, causal, initial_yaw_rad):
         if name == "imu":
             imu_s, accel_z = time_s, plain_vertical(stream, time_s, robot, signals)
         if name == "odometry":
-            for row in CAMERA_ROWS[:2]:
-                frozen = plain_frozen(signals[row], REPEATED[FIRST_SPEED], moving(came_s))
+            for row in feed.CAMERA_ROWS[:2]:
+                frozen = plain_frozen(signals[row], feed.REPEATED[feed.FIRST_SPEED], moving(came_s))
                 signals[row] = np.where(frozen, np.nan, signals[row])
             yaw = signals["camera_yaw_rad"]
-            sums = plain_sums(time_s, yaw, *SIGNALS["camera_yaw_rad"][1:])
+            sums = plain_sums(time_s, yaw, *feed.SIGNALS["camera_yaw_rad"][1:])
             signals["camera_yaw_rad"] = np.where(np.isnan(yaw), np.nan, yaw - sums)
         found = {
-            row: plain_jumps(time_s, v, *((np.inf, np.inf) if row == "camera_yaw_rad" else SIGNALS[row][1:]))
+            row: plain_jumps(
+                time_s, v, *((np.inf, np.inf) if row == "camera_yaw_rad" else feed.SIGNALS[row][1:])
+            )
             for row, v in signals.items()
         }
         jumps[name] = int(np.any(list(found.values()), axis=0).sum())
@@ -328,7 +298,7 @@ def plain_table(run, robot, causal, initial_yaw_rad):
     derived, square = plain_derived(clock, table, once, twice, imu_s, accel_z, robot)
     came_s = imu_s + (robot.sensors.imu_latency_s if causal else 0.0)
     known = np.isfinite(square)
-    last = np.searchsorted(came_s[known], clock + TICK_S, side="right") - 1
+    last = np.searchsorted(came_s[known], clock + feed.TICK_S, side="right") - 1
     derived["vibration_mps2"] = np.where(last >= 0, np.sqrt(square[known][np.maximum(last, 0)]), np.nan)
     table |= derived
     wheel_speed_mps = np.column_stack([table[row] for row in rows[:3]]) * robot.wheel_radius_m
@@ -342,17 +312,17 @@ def plain_wheels(clock, motor_radps, rates, robot):
     for _ in range(3):  # motion follows from the rates that are left, and is known one tick later
         counts = np.column_stack([plain_counts(column) for column in motor_radps.T])
         lively = (counts <= 2).any(axis=1)
-        frozen = [plain_frozen(v, REPEATED[FIRST_WHEEL + 0], moving) for v in motor_radps.T]
+        frozen = [plain_frozen(v, feed.REPEATED[feed.FIRST_WHEEL + 0], moving) for v in motor_radps.T]
         kept = np.where(np.column_stack(frozen) & lively[:, None], np.nan, rates)
         once, _, _ = plain_moving(clock, kept * robot.wheel_radius_m)
-        moving = np.append(False, (np.abs(once[:-1]) > MOVING_MPS).any(axis=1))
+        moving = np.append(False, (np.abs(once[:-1]) > feed.MOVING_MPS).any(axis=1))
     return kept
 
 
 def plain_counts(value):
     counts, last = np.zeros(value.size), np.nan
     for k in range(value.size):
-        counts[k] = counts[k - 1] + 1 if abs(value[k] - last) <= SAME else 0
+        counts[k] = counts[k - 1] + 1 if abs(value[k] - last) <= feed.SAME else 0
         if np.isnan(value[k]):
             counts[k] = counts[k - 1] if k else 0
         else:
@@ -362,7 +332,7 @@ def plain_counts(value):
 
 def plain_lives(name, stream, moving):
     """Leave out the channels of an IMU or a camera that repeat themselves in motion."""
-    most = {"imu": REPEATED, "odometry": REPEATED[FIRST_CAMERA:]}.get(name)
+    most = {"imu": feed.REPEATED, "odometry": feed.REPEATED[feed.FIRST_CAMERA :]}.get(name)
     if most is None:
         return stream
     values = np.array(stream.values)
@@ -376,7 +346,7 @@ def plain_vertical(imu, time_s, robot, signals):
     sensors, roll, pitch = robot.sensors, imu.channel("roll_rad"), imu.channel("pitch_rad")
     jumped = np.zeros(len(roll), dtype=bool)
     for angle in (roll, pitch):
-        sums = plain_sums(time_s, angle, 0.05, 3.0, LATCHED, 0.02)
+        sums = plain_sums(time_s, angle, 0.05, 3.0, feed.LATCHED, 0.02)
         jumped |= np.isfinite(angle) & (sums != 0.0)
     for row in ("accel_x_mps2", "accel_y_mps2"):
         signals[row] = np.where(jumped, np.nan, signals[row])
