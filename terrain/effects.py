@@ -1,7 +1,7 @@
 """Effects: named groups of parameters of the simulation that are 0 where the effect is absent.
 
-An entry holds all about an effect: bounds, formula, source, robots, channels, the stage where it acts, where a
-description has it, how it is taken off samples, and its words.
+An entry holds all about an effect: bounds, robots, channels, the stage where it acts, where a description has it,
+how it is taken off samples, and its words.
 
 Signals of the formulas are those of :mod:`terrain.simulation.plants.planar`: ``u`` the speed that the wheels
 would roll without slip, ``v`` the speed over ground, ``d`` a steering angle, ``w`` the yaw rate, ``F`` the
@@ -9,8 +9,8 @@ traction, ``W = m g`` the nominal weight, ``f = F / W``, ``th`` the grade (uphil
 (left side up positive), ``B`` the track, ``dv`` right minus left wheel speed and
 ``q = |dv| / (|dv| + 2 |u|)`` how tight a turn is.
 
-To add an effect, write its entry into the library, and its formula into the kernels of
-:mod:`terrain.simulation.plants.planar`.  Everything else reads the entry.
+To add an effect, write its entry into the library, with formula, source and how it is taken off samples above it,
+and its formula into the kernels of :mod:`terrain.simulation.plants.planar`.  Everything else reads the entry.
 
 The section ``effects`` of a robot's description has those found by ``terrain explain``.  Each parameter is a
 number with unit, source and interval like any other; the covariance has a row a parameter, and may be left
@@ -121,7 +121,6 @@ class Inverse(NamedTuple):
     """
 
     streams: tuple[str, ...]  #: whose samples or stamps change
-    formula: str  #: corrected from measured, in the signals of this module
     columns: tuple[str, ...] = ()  #: beginnings of the channels that change, or STAMPS
     combine: Combine = Combine.ADDED  #: how the corrected number follows from the measured one
     without_home: bool = False  #: only where the description lacks the section of the parameter's home
@@ -193,8 +192,6 @@ class Effect(NamedTuple):
 
     name: str  #: as --effect and results have it
     parameters: tuple[Parameter, ...]
-    formula: str  #: in the signals of this module
-    source: str
     drives: tuple[str, ...]  #: kinds of robots that it applies to
     channels: tuple[str, ...]  #: where it is visible: a tenth as clearly over the noise as in the clearest
     needs: str  #: the driving that excites it
@@ -222,7 +219,7 @@ def effect(
 ) -> Effect:
     """Return an effect of one parameter, given by its unit alone: its name is that of the effect, and the unit.
 
-    ``entry`` and ``others`` are the fields of :class:`Effect` from the formula on.
+    ``entry`` and ``others`` are the fields of :class:`Effect` from the drives on.
     """
     named = parameter._replace(name=f"{name}_{parameter.name}", homes=homes, inverse=inverse)
     return Effect(name, (named,), *entry, **others)
@@ -478,8 +475,6 @@ def _undo_camera_yaw(block: Block, angle_rad: float) -> None:
 
 # -- The catalogue --------------------------------------------------------------------------------------------
 
-KINEMATICS = "kinematics of a planar robot"
-
 _contact = partial(effect, stage=Stage.CONTACT)
 _sensor = partial(effect, sensed_only=True, stage=Stage.SENSORS)
 _described_sensor = partial(effect, sensed_only=True, stage=Stage.DESCRIPTION)
@@ -487,13 +482,12 @@ _described_sensor = partial(effect, sensed_only=True, stage=Stage.DESCRIPTION)
 
 def _steering_offset(wheel: int) -> Effect:
     name = f"steering_offset_{wheel}"
+    # d_N = measured angle + d0 (kinematics of a planar robot)
     return effect(
         name,
         Parameter("rad", -0.3, 0.3, 0.005),
-        f"d_{wheel} = measured angle + d0",
-        KINEMATICS,
         (SWERVE,),
-        (*MOTION, HEADING) if wheel < 3 else MOTION,  # wheel 3 is beside the middle, and hardly turns it
+        (*MOTION, HEADING) if wheel < 3 else MOTION,
         "several speeds and standstill",
         homes=(Home("steering", f"zero_{wheel}_rad", Combine.SUBTRACTED),),
         stage=Stage.LINKAGE,
@@ -507,21 +501,16 @@ def _wheel_scale(wheel: int) -> Effect:
     determine three; one alone looks like neither.
     """
     name = f"wheel_scale_{wheel}"
+    # wheel speed N = (1 + e) x measured (kinematics of a planar robot)
+    # an encoder that loses counts, or a tyre of another wear: a fifth is more than either
+    # Taken off: rate and speed of wheel N x (1 + e)
     return effect(
         name,
-        # an encoder that loses counts, or a tyre of another wear: a fifth is more than either
         Parameter("ratio", -0.2, 0.2, 0.01, as_percent=True, is_error=True),
-        f"wheel speed {wheel} = (1 + e) x measured",
-        KINEMATICS,
         (SWERVE,),
         (*MOTION, HEADING),
         "straight drives in several directions",
-        inverse=Inverse(
-            ("wheels",),
-            f"rate and speed of wheel {wheel} x (1 + e)",
-            (f"motor_{wheel}_", f"speed_{wheel}_"),
-            Combine.TIMES,
-        ),
+        inverse=Inverse(("wheels",), (f"motor_{wheel}_", f"speed_{wheel}_"), Combine.TIMES),
         stage=Stage.SENSORS,
     )
 
@@ -529,42 +518,32 @@ def _wheel_scale(wheel: int) -> Effect:
 #: Streams that are not stamped by the logger of the wheels.
 OTHER_LOGGER = ("imu", "odometry", "gnss", "lidar")
 
-LAW = "this project's; docs/measured_slip.md has how it holds on measured runs"
-
-SINGLE_TRACK = "linear single-track model: Rajamani, Vehicle Dynamics and Control"
-
 #: Every known effect.  The order is no ranking, but results list effects in it.
 LIBRARY: tuple[Effect, ...] = (
-    # Wheels and steering
+    # == Wheels and steering
+    # wheel speed = (1 + e) r x wheel rate, torque = (1 + e) r F (kinematics of a planar robot)
+    # Taken off: wheel speed in m/s x (1 + e), where a log has it
     effect(
         "wheel_radius",
         Parameter("ratio", -0.3, 0.3, 0.01, scatter_rank=5, as_percent=True, is_error=True),
-        "wheel speed = (1 + e) r x wheel rate, torque = (1 + e) r F",
-        KINEMATICS,
         EVERY,
         (*MOTION, CURRENT, HEADING),
         "any speed; slopes and accelerations to part it from slip",
         homes=(Home("", "wheel_radius_m", Combine.TIMES),),
-        inverse=Inverse(
-            ("wheels",), "wheel speed in m/s x (1 + e), where a log has it", ("speed_",), Combine.TIMES
-        ),
+        inverse=Inverse(("wheels",), ("speed_",), Combine.TIMES),
         stage=Stage.BODY,
         aliases=("encoder_scale",),
     ),
+    # wheel speeds of the right side x (1 + e/2), of the left x (1 - e/2) (kinematics of a planar robot)
+    # pressure and wear of tyres differ by a few percent from side to side
+    # Taken off: rates and speeds of the right side x (1 + e/2), left x (1 - e/2)
     effect(
         "one_sided_radius",
-        # pressure and wear of tyres differ by a few percent from side to side
         Parameter("ratio", -0.1, 0.1, 0.008, scatter_rank=6, as_percent=True, is_error=True),
-        "wheel speeds of the right side x (1 + e/2), of the left x (1 - e/2)",
-        KINEMATICS,
         BOTH,
         (*MOTION, HEADING),
         "fast and straight",
-        inverse=Inverse(
-            ("wheels", "truth"),
-            "rates and speeds of the right side x (1 + e/2), left x (1 - e/2)",
-            undo=_undo_one_sided_radius,
-        ),
+        inverse=Inverse(("wheels", "truth"), undo=_undo_one_sided_radius),
         stage=Stage.BODY,
         words=_sided(
             100.0, "{wheels} that are {number} % {side} on the right than on the left", "larger", "smaller"
@@ -572,124 +551,118 @@ LIBRARY: tuple[Effect, ...] = (
     ),
     *(_wheel_scale(wheel) for wheel in (1, 2, 3)),
     *(_steering_offset(wheel) for wheel in (1, 2, 3)),
+    # d follows the measured angle through a play of half width b (play operator; Krasnosel'skii and
+    # Pokrovskii, Systems with Hysteresis, 1989)
+    # Taken off: angles pass through a play of half width b
     effect(
         "steering_backlash",
         Parameter("rad", 0.0, 0.2, 0.003, one_sided=True, deprecated=("steering_play_rad",)),
-        "d follows the measured angle through a play of half width b",
-        "play operator; Krasnosel'skii and Pokrovskii, Systems with Hysteresis, 1989",
         (SWERVE, BICYCLE),
         (*MOTION, HEADING),
         "reversals of the steering",
-        inverse=Inverse(
-            ("steering",), "angles pass through a play of half width b", undo=_undo_steering_backlash
-        ),
+        inverse=Inverse(("steering",), undo=_undo_steering_backlash),
         stage=Stage.LINKAGE,
         deprecated=("steering_play",),
     ),
+    # d(t) = measured angle at t - T (kinematics of a planar robot)
+    # Taken off: stamp t + T
     effect(
         "steering_delay",
         Parameter("s", 0.0, 0.5, 0.01),
-        "d(t) = measured angle at t - T",
-        KINEMATICS,
         (SWERVE, BICYCLE),
         (*MOTION, HEADING),
         "steps of the steering",
-        inverse=Inverse(("steering",), "stamp t + T", STAMPS, Combine.ADDED),
+        inverse=Inverse(("steering",), STAMPS, Combine.ADDED),
         stage=Stage.LINKAGE,
     ),
+    # w(t) = what the wheels ask for at t - T (pure delay)
+    # Taken off: right minus left wheel speed of t - T
     effect(
         "yaw_delay",
         Parameter("s", 0.0, 0.5, 0.01),
-        "w(t) = what the wheels ask for at t - T",
-        "pure delay",
         SKIDDING,
         (GYRO, SPEED_Y, HEADING),
         "steps of the yaw rate",
-        inverse=Inverse(("wheels",), "right minus left wheel speed of t - T", undo=_undo_yaw_delay),
+        inverse=Inverse(("wheels",), undo=_undo_yaw_delay),
         words=_late("the robot turning"),
     ),
-    # Sensors: they change what a log holds of a motion; most of them nothing else
+    # == Sensors: they change what a log holds of a motion; most of them nothing else
+    # gyro = w + b (IEEE Std 952)
+    # 3 deg/s, the zero error of MEMS gyros as data sheets have it (Bosch BMI055: 1 deg/s)
+    # Taken off: gyro - b where the description has no home; fused yaw - b t
     _described_sensor(
         "gyro_bias",
-        # 3 deg/s, the zero error of MEMS gyros as data sheets have it (Bosch BMI055: 1 deg/s)
         Parameter("radps", -0.05, 0.05, 0.001, scatter_rank=1),
-        "gyro = w + b",
-        "IEEE Std 952",
         WITH_IMU,
         (GYRO,),
         "standstill; several runs, since every power-on has a bias of its own",
         homes=(Home("sensors", "gyro_bias_z_radps", Combine.ADDED),),
-        inverse=Inverse(
-            ("imu",), "gyro - b where the description has no home; fused yaw - b t", undo=_undo_gyro
-        ),
+        inverse=Inverse(("imu",), undo=_undo_gyro),
     ),
+    # gyro = (1 + k) w (IEEE Std 952)
+    # data sheets of MEMS gyros have 1 to 4 %; a part that is off by more than 15 % is broken
+    # Taken off: (gyro - bias) / (1 + k) + bias; fused yaw / (1 + k)
     _sensor(
         "gyro_scale",
-        # data sheets of MEMS gyros have 1 to 4 %; a part that is off by more than 15 % is broken
         Parameter("ratio", -0.15, 0.15, 0.01, as_percent=True, is_error=True),
-        "gyro = (1 + k) w",
-        "IEEE Std 952",
         WITH_IMU,
         (GYRO,),
         "turns, and an absolute heading on a skid-steer robot",
-        inverse=Inverse(("imu",), "(gyro - bias) / (1 + k) + bias; fused yaw / (1 + k)", undo=_undo_gyro),
+        inverse=Inverse(("imu",), undo=_undo_gyro),
         twins=(("effective_track", HEADING),),
         words=_sided(100.0, "a gyro that reads {number} % too {side}", "much", "little"),
     ),
+    # accelerometer = a_x + g sin th + b (IEEE Std 1293)
+    # Taken off: accelerometer - b
     _described_sensor(
         "accel_bias",
         Parameter("mps2", -2.0, 2.0, 0.02, scatter_rank=2),
-        "accelerometer = a_x + g sin th + b",
-        "IEEE Std 1293",
         WITH_IMU,
         (ACCEL,),
         "several runs, since every power-on has a bias of its own",
         homes=(Home("sensors", "accel_bias_x_mps2", Combine.ADDED, scaled_by="accel_scale_x_ratio"),),
-        inverse=Inverse(("imu",), "accelerometer - b", ("accel_x_",), Combine.SUBTRACTED, without_home=True),
+        inverse=Inverse(("imu",), ("accel_x_",), Combine.SUBTRACTED, without_home=True),
         aliases=("accelerometer_mounting_pitch",),
     ),
+    # gyro, accelerometer and tilt(t) = what they measure at t - T (pure delay; the samples of one IMU
+    # arrive together)
+    # as much of it and of camera_latency is a clock_offset: logs determine two of the three
+    # Taken off: stamp t - T
     effect(
         "imu_latency",
-        # as much of it and of camera_latency is a clock_offset: logs determine two of the three
         Parameter("s", 0.0, 0.5, 0.005),
-        "gyro, accelerometer and tilt(t) = what they measure at t - T",
-        "pure delay; the samples of one IMU arrive together",
         WITH_IMU,
         (GYRO, ACCEL),
         "steps of the yaw rate, and a camera that is not late",
         homes=(Home("sensors", "imu_latency_s", Combine.ADDED),),
-        inverse=Inverse(("imu",), "stamp t - T", STAMPS, Combine.SUBTRACTED, without_home=True),
+        inverse=Inverse(("imu",), STAMPS, Combine.SUBTRACTED, without_home=True),
         stage=Stage.DESCRIPTION,
         words=_late("the IMU"),
     ),
+    # camera(t) = what it sees at t - T (pure delay)
+    # measured: 0.16 s (Husky) and 0.3 to 0.5 s (Warthog), poses of a lidar's scans, DRIVE
     _described_sensor(
         "camera_latency",
-        # measured: 0.16 s (Husky) and 0.3 to 0.5 s (Warthog), poses of a lidar's scans, DRIVE
         Parameter("s", 0.0, 1.0, 0.005),
-        "camera(t) = what it sees at t - T",
-        "pure delay",
         EVERY,
         (SPEED_X, SPEED_Y, HEADING),
         "accelerations at two frequencies",
         homes=(Home("camera", "latency_s", Combine.ADDED),),
         words=_late("the camera or lidar"),
     ),
+    # camera = R(-a) (v_x, v_y): mounted turned to the left by -a, v_y grows by a v (kinematics of a
+    # planar robot)
+    # Taken off: R(a) of what the camera measured; yaw of a pose + a
     _sensor(
         "camera_yaw",
         Parameter("rad", -0.3, 0.3, 0.005),
-        "camera = R(-a) (v_x, v_y): mounted turned to the left by -a, v_y grows by a v",
-        KINEMATICS,
         EVERY,
         (SPEED_X, SPEED_Y),
         "straight, on more than one side slope",
-        inverse=Inverse(
-            ("odometry", "lidar", "pose"),
-            "R(a) of what the camera measured; yaw of a pose + a",
-            undo=_undo_camera_yaw,
-            act=_act_camera_yaw,
-        ),
+        inverse=Inverse(("odometry", "lidar", "pose"), undo=_undo_camera_yaw, act=_act_camera_yaw),
         words=_sided(math.degrees(1.0), "the camera turned {number}° to the {side}", "right", "left"),
     ),
+    # v_x - l_y w, v_y + l_x w at the camera (kinematics of a planar robot)
     Effect(
         "lever_arm",
         tuple(
@@ -698,8 +671,6 @@ LIBRARY: tuple[Effect, ...] = (
             )
             for name in ("lever_x", "lever_y")
         ),
-        "v_x - l_y w, v_y + l_x w at the camera",
-        KINEMATICS,
         EVERY,
         (SPEED_X, SPEED_Y),
         "turns to both sides",
@@ -707,48 +678,46 @@ LIBRARY: tuple[Effect, ...] = (
         stage=Stage.DESCRIPTION,
         words=_lever_arm,
     ),
+    # IMU and camera stamp t' = t + T; wheels, currents and steering t: for T < 0 these are the late ones
+    # (two loggers without a common clock)
+    # Taken off: stamp t' - T
     effect(
         "clock_offset",
         Parameter("s", -0.5, 0.5, 0.005),
-        "IMU and camera stamp t' = t + T; wheels, currents and steering t: for T < 0 these are the late ones",
-        "two loggers without a common clock",
         WITH_IMU,
         (*MOTION, HEADING),
         "switching manoeuvres",
-        inverse=Inverse(OTHER_LOGGER, "stamp t' - T", STAMPS, Combine.SUBTRACTED),
+        inverse=Inverse(OTHER_LOGGER, STAMPS, Combine.SUBTRACTED),
         stage=Stage.SENSORS,
         words=_late("the other sensors logged", "the wheels logged"),
     ),
+    # IMU and camera stamp t' = (1 + r) t (two loggers without a common clock)
+    # Taken off: stamp t' / (1 + r), from the first stamp of the wheels
     effect(
         "clock_rate",
         Parameter("ratio", -0.02, 0.02, 0.0005, as_percent=True, is_error=True),
-        "IMU and camera stamp t' = (1 + r) t",
-        "two loggers without a common clock",
         WITH_IMU,
         (*MOTION, HEADING),
         "switching manoeuvres from the start of a run to its end",
-        inverse=Inverse(
-            OTHER_LOGGER, "stamp t' / (1 + r), from the first stamp of the wheels", STAMPS, Combine.OVER
-        ),
+        inverse=Inverse(OTHER_LOGGER, STAMPS, Combine.OVER),
         stage=Stage.SENSORS,
     ),
+    # T d(measured)/dt + measured = wheel rate (first-order low-pass)
     effect(
         "encoder_lag",
         Parameter("s", 0.0, 0.5, 0.005),
-        "T d(measured)/dt + measured = wheel rate",
-        "first-order low-pass",
         WITH_IMU,
         (*MOTION, CURRENT, TURNING_CURRENT, HEADING),
         "accelerations",
         homes=(Home("sensors", "encoder_time_constant_s", Combine.ADDED),),
         stage=Stage.DESCRIPTION,
     ),
-    # Slip and resistance
+    # == Slip and resistance
+    # w = dv / (B (1 + e)) (Mandow et al., Experimental kinematics for wheeled skid-steer mobile robots,
+    # IROS 2007)
     effect(
         "effective_track",
         Parameter("ratio", -0.5, 4.0, 0.02, scatter_rank=9, as_percent=True, is_error=True),
-        "w = dv / (B (1 + e))",
-        "Mandow et al., Experimental kinematics for wheeled skid-steer mobile robots, IROS 2007",
         SKIDDING,
         (GYRO, SPEED_Y, HEADING),
         "turns in place and in arcs, and an absolute heading",
@@ -756,109 +725,92 @@ LIBRARY: tuple[Effect, ...] = (
         twins=(("gyro_scale", HEADING),),
         words=_track,
     ),
+    # dv loses D = k q dv, shared as u_r = D a/(a+b), u_l = -D b/(a+b), a = |v_r|^(1-n), b = |v_l|^(1-n),
+    # n = 0.5 (Endo et al., IROS 2007, as in Yamauchi et al., (27) written without its singular points;
+    # the size of D is this project's)
     effect(
         "turning_slip",
         Parameter("ratio", -0.5, 0.9, 0.02),
-        "dv loses D = k q dv, shared as u_r = D a/(a+b), u_l = -D b/(a+b), a = |v_r|^(1-n), b = |v_l|^(1-n), "
-        "n = 0.5",
-        "Endo et al., IROS 2007, as in Yamauchi et al., (27) written without its singular points; the size "
-        "of D is this project's",
         SKIDDING,
         (*MOTION, HEADING),
         "arcs of several radii and turns in place",
     ),
+    # n = 0.5 + e in turning_slip (Endo et al., IROS 2007, as in Yamauchi et al., (27))
+    # n from 0, in proportion to the speeds, to 1, alike; Endo et al. fitted one to each ground
     effect(
         "turning_slip_power",
-        # n from 0, in proportion to the speeds, to 1, alike; Endo et al. fitted one to each ground
         Parameter("ratio", -0.5, 0.5, 0.02),
-        "n = 0.5 + e in turning_slip",
-        "Endo et al., IROS 2007, as in Yamauchi et al., (27)",
         (TRACKED,),
         (SPEED_X, ACCEL, CURRENT),
         "arcs of several radii with much turning slip",
         modifies="turning_slip",
     ),
+    # w grows by x/(1 + x), x = c (u w)^2 / (1 + (w / w0)^2), w0 = 1 rad/s, u and w without it (lateral
+    # acceleration moves the centre of rotation ahead by s0, about c' u (turn_side_slip), and the moment
+    # that resists turning falls with (2 s0 / L)^2: Wong, Theory of Ground Vehicles, skid-steering at high
+    # speeds; that it builds up with w, and the bounded form, are this project's)
+    # measured: 0.03 to 0.045 s^2/m^2 (Warthog on asphalt and gravel, up to 3.5 m/s and 2.8 rad/s); it
+    # goes with 1/mu^2, and would be 2 at mu = 0.1
     effect(
         "track_narrowing",
-        # measured: 0.03 to 0.045 s^2/m^2 (Warthog on asphalt and gravel, up to 3.5 m/s and 2.8 rad/s); it
-        # goes with 1/mu^2, and would be 2 at mu = 0.1
         Parameter("s2pm2", 0.0, 2.0, 0.02),
-        "w grows by x/(1 + x), x = c (u w)^2 / (1 + (w / w0)^2), w0 = 1 rad/s, u and w without it",
-        "lateral acceleration moves the centre of rotation ahead by s0, about c' u (turn_side_slip), and the "
-        "moment that resists turning falls with (2 s0 / L)^2: Wong, Theory of Ground Vehicles, skid-steering "
-        "at high speeds; that it builds up with w, and the bounded form, are this project's",
         SKIDDING,
         (GYRO, SPEED_Y, HEADING),
         "fast arcs, and turns in place",
         words=_fast_turns,
     ),
+    # u / (1 + c w^2) in place of u, about u (1 - c w^2), and that itself for c < 0; w as simulated, with
+    # the effective track (second-order loss of speed in turns, as in the logs of Baril et al., DRIVE,
+    # ICRA 2024; the bounded form is this project's)
+    # measured: 0.02 to 0.1 s^2 (Warthog on asphalt and sand), 0.6 to 0.9 s^2 (Husky)
     effect(
         "turn_drag",
-        # measured: 0.02 to 0.1 s^2 (Warthog on asphalt and sand), 0.6 to 0.9 s^2 (Husky)
         Parameter("s2", -0.1, 3.0, 0.005),
-        "u / (1 + c w^2) in place of u, about u (1 - c w^2), and that itself for c < 0; w as simulated, with "
-        "the effective track",
-        "second-order loss of speed in turns, as in the logs of Baril et al., DRIVE, ICRA 2024; the bounded "
-        "form is this project's",
         SKIDDING,
         (SPEED_X,),
         "arcs of several yaw rates",
         words=_turn_drag,
     ),
+    # v = u - |u| c f (linear part of any thrust curve; Wong, Theory of Ground Vehicles)
     _contact(
         "force_slip",
         Parameter("ratio", -0.3, 3.0, 0.02, scatter_rank=8),
-        "v = u - |u| c f",
-        "linear part of any thrust curve; Wong, Theory of Ground Vehicles",
         EVERY,
         (SPEED_X, SPEED_Y),
         "slopes and accelerations",
     ),
+    # f = f_max (1 - K/(s l) (1 - exp(-s l/K))), with K/l = c f_max / 2 so that c is its slip per force at
+    # the start (Janosi and Hanamoto 1961, as integrated along the contact (Yamauchi et al., (17),
+    # corrected))
     _contact(
         "shear_slip",
         Parameter("ratio", 0.0, 3.0, 0.02),
-        "f = f_max (1 - K/(s l) (1 - exp(-s l/K))), with K/l = c f_max / 2 so that c is its slip per force "
-        "at the start",
-        "Janosi and Hanamoto 1961, as integrated along the contact (Yamauchi et al., (17), corrected)",
         WITH_IMU,
         (SPEED_X, SPEED_Y),
         "tractions over half of f_max, of both small and large size",
     ),
+    # resistance grows by b |s| W (Lyasko, Slip sinkage effect in soil-vehicle mechanics, J.
+    # Terramechanics 2010: linear in slip)
     _contact(
-        "slip_resistance",
-        Parameter("ratio", 0.0, 5.0, 0.05),
-        "resistance grows by b |s| W",
-        "Lyasko, Slip sinkage effect in soil-vehicle mechanics, J. Terramechanics 2010: linear in slip",
-        BOTH,
-        (CURRENT, SPEED_X),
-        "a range of slip",
+        "slip_resistance", Parameter("ratio", 0.0, 5.0, 0.05), BOTH, (CURRENT, SPEED_X), "a range of slip"
     ),
+    # resistance grows by c W (Wong, Theory of Ground Vehicles)
+    # without currents it shows by the slip that it takes, as a smaller wheel radius does
     _contact(
         "rolling_resistance",
-        # without currents it shows by the slip that it takes, as a smaller wheel radius does
         Parameter("ratio", -0.05, 0.5, 0.005, scatter_rank=7),
-        "resistance grows by c W",
-        "Wong, Theory of Ground Vehicles",
         BOTH,
         (CURRENT, SPEED_X),
         "several speeds, forward and backward",
     ),
-    _contact(
-        "viscous_drag",
-        Parameter("nspm", 0.0, 500.0, 3.0),
-        "resistance grows by c v",
-        "viscous friction of bearings and gears",
-        BOTH,
-        (CURRENT, SPEED_X),
-        "three speeds",
-    ),
-    # Load and motors
+    # resistance grows by c v (viscous friction of bearings and gears)
+    _contact("viscous_drag", Parameter("nspm", 0.0, 500.0, 3.0), BOTH, (CURRENT, SPEED_X), "three speeds"),
+    # == Load and motors
+    # mass m (1 + p) (Newton)
     effect(
         "payload",
         Parameter("ratio", -0.5, 1.5, 0.02, as_percent=True),
-        "mass m (1 + p)",
-        "Newton",
-        (*BOTH, OMNI),  # of a car, whose currents are not logged, it looks like its tyres
+        (*BOTH, OMNI),
         (CURRENT, SPEED_X),
         "accelerations and slopes",
         homes=(
@@ -869,53 +821,49 @@ LIBRARY: tuple[Effect, ...] = (
         twins=(("motor_constant", SPEED_X),),
         beside=((OMNI, "roller_friction"),),
     ),
+    # current (1 + q) (DC motor: current is torque over its constant)
+    # Taken off: current / (1 + q)
     _described_sensor(
         "motor_constant",
         Parameter("ratio", -0.5, 1.0, 0.01, as_percent=True, is_error=True),
-        "current (1 + q)",
-        "DC motor: current is torque over its constant",
         BOTH,
         (CURRENT, TURNING_CURRENT),
         "accelerations and slopes",
         homes=(Home("motors", "torque_constant_nmpa", Combine.OVER),),
-        inverse=Inverse(("wheels",), "current / (1 + q)", ("current_",), Combine.OVER, without_home=True),
+        inverse=Inverse(("wheels",), ("current_",), Combine.OVER, without_home=True),
         twins=(("payload", SPEED_X),),
     ),
+    # current (1 + q t / 60 s) from the start of a run (remanence of a magnet that warms; linear over a
+    # run)
+    # Taken off: current / (1 + q t / 60 s), from the first stamp of the wheels
     _sensor(
         "motor_drift",
         Parameter("ratio", -0.5, 1.0, 0.01, as_percent=True),
-        "current (1 + q t / 60 s) from the start of a run",
-        "remanence of a magnet that warms; linear over a run",
         BOTH,
         (CURRENT, TURNING_CURRENT),
         "long runs",
-        inverse=Inverse(
-            ("wheels",),
-            "current / (1 + q t / 60 s), from the first stamp of the wheels",
-            combine=Combine.OVER,
-            undo=_undo_motor_drift,
-            act=_act_motor_drift,
-        ),
+        inverse=Inverse(("wheels",), combine=Combine.OVER, undo=_undo_motor_drift, act=_act_motor_drift),
     ),
+    # current of each motor + b: n b in the sum of n motors, nothing in the difference of the sides (zero
+    # error of a current sensor)
+    # zero of a Hall sensor: up to 2 % of a range of 50 to 200 A
+    # Taken off: current of each motor - b
     _sensor(
         "current_offset",
-        # zero of a Hall sensor: up to 2 % of a range of 50 to 200 A
         Parameter("a", -4.0, 4.0, 0.05),
-        "current of each motor + b: n b in the sum of n motors, nothing in the difference of the sides",
-        "zero error of a current sensor",
         BOTH,
         (CURRENT,),
         "standstill, and driving forward and backward",
-        inverse=Inverse(("wheels",), "current of each motor - b", ("current_",), Combine.SUBTRACTED),
+        inverse=Inverse(("wheels",), ("current_",), Combine.SUBTRACTED),
     ),
-    # Sideways motion
+    # == Sideways motion
+    # v_y = -c v_x w: to the outside of a turn (m (dv_y/dt + w v_x) = -K v_y with c = m/K; the centre of
+    # rotation lies c v_x ahead: Mandow et al., Experimental kinematics for wheeled skid-steer mobile
+    # robots, IROS 2007)
+    # measured: 0.11 to 0.19 s (Husky; Warthog on asphalt, gravel and sand), DRIVE, as turn_drag
     effect(
         "turn_side_slip",
-        # measured: 0.11 to 0.19 s (Husky; Warthog on asphalt, gravel and sand), DRIVE, as turn_drag
         Parameter("s", -0.5, 0.5, 0.005),
-        "v_y = -c v_x w: to the outside of a turn",
-        "m (dv_y/dt + w v_x) = -K v_y with c = m/K; the centre of rotation lies c v_x ahead: Mandow et al., "
-        "Experimental kinematics for wheeled skid-steer mobile robots, IROS 2007",
         SKIDDING,
         (SPEED_Y,),
         "arcs of several speeds, to both sides",
@@ -925,116 +873,109 @@ LIBRARY: tuple[Effect, ...] = (
             *("outside", "inside"),
         ),
     ),
+    # T dv_y/dt + v_y = -c v_x w (first-order lag of the lateral motion: the inertia in m (dv_y/dt + w
+    # v_x) = -K v_y)
+    # with the friction of turn_side_slip its time constant would be c, 0.2 s at the most where measured
     effect(
         "side_slip_build_up",
-        # with the friction of turn_side_slip its time constant would be c, 0.2 s at the most where measured
         Parameter("s", 0.0, 1.0, 0.01, one_sided=True),
-        "T dv_y/dt + v_y = -c v_x w",
-        "first-order lag of the lateral motion: the inertia in m (dv_y/dt + w v_x) = -K v_y",
         SKIDDING,
         (SPEED_Y,),
         "steps of the yaw rate while driving",
         modifies="turn_side_slip",
     ),
+    # resistance to rolling and to turning grow by k q W (scrub of skidding wheels; the form in q as EKF
+    # practice has it)
     effect(
-        "scrub",
-        Parameter("ratio", -0.2, 1.0, 0.005),
-        "resistance to rolling and to turning grow by k q W",
-        "scrub of skidding wheels; the form in q as EKF practice has it",
-        SKIDDING,
-        (CURRENT, TURNING_CURRENT, SPEED_X),
-        "turns",
+        "scrub", Parameter("ratio", -0.2, 1.0, 0.005), SKIDDING, (CURRENT, TURNING_CURRENT, SPEED_X), "turns"
     ),
+    # v_y = -c ph |v| (Yamauchi et al., (2), with the sign that gravity sets)
     _contact(
-        "side_hill_slip",
-        Parameter("ratio", 0.0, 5.0, 0.05),
-        "v_y = -c ph |v|",
-        "Yamauchi et al., (2), with the sign that gravity sets",
-        WITH_IMU,
-        (SPEED_Y,),
-        "both signs of roll",
+        "side_hill_slip", Parameter("ratio", 0.0, 5.0, 0.05), WITH_IMU, (SPEED_Y,), "both signs of roll"
     ),
-    # What makes omni robots slip, and what looks like it
+    # == What makes omni robots slip, and what looks like it
+    # across each wheel G = -r n W v_across / U, beside F = C n W (u - v_along) / U along it (this
+    # project's; docs/measured_slip.md has how it holds on measured runs)
     effect(
         "roller_friction",
         Parameter("ratio", 0.0, 1.5, 0.01),
-        "across each wheel G = -r n W v_across / U, beside F = C n W (u - v_along) / U along it",
-        LAW,
         (OMNI,),
         (SPEED_X, SPEED_Y, HEADING, GYRO, CURRENT),
         "straight drives in several directions",
     ),
+    # n_i = (1 + 2 c . p_i / d^2) / 3 of wheels at p_i, d from the middle, with the centre of mass c
+    # (balance of moments)
+    # measured: 16 mm ahead by weights (Robotino)
     Effect(
         "load_shift",
-        # measured: 16 mm ahead by weights (Robotino)
         tuple(
             Parameter(
-                f"load_shift_{axis}_m", -0.05, 0.05, 0.001, (Home("body", f"com_{axis}_m", Combine.ADDED),)
+                f"load_shift_{axis}_m",
+                -0.05,
+                0.05,
+                0.001,
+                (Home("body", f"com_{axis}_m", Combine.ADDED),),
             )
             for axis in ("x", "y")
         ),
-        "n_i = (1 + 2 c . p_i / d^2) / 3 of wheels at p_i, d from the middle, with the centre of mass c",
-        "balance of moments",
         (OMNI,),
         (SPEED_X, SPEED_Y, HEADING, GYRO),
         "straight drives in several directions over ground on which the rollers resist",
         words=_centre_of_mass,
     ),
+    # w = mean wheel speed / (d (1 + e)) (kinematics of a planar robot)
+    # a tape measures it to a few per cent; measured turns: 0.120 to 0.128 m of 0.125 m (Robotino)
     effect(
         "wheel_distance",
-        # a tape measures it to a few per cent; measured turns: 0.120 to 0.128 m of 0.125 m (Robotino)
         Parameter("ratio", -0.1, 0.1, 0.005, as_percent=True, is_error=True),
-        "w = mean wheel speed / (d (1 + e))",
-        KINEMATICS,
         (OMNI,),
         (HEADING, GYRO),
         "turns",
         homes=(Home("", "track_m", Combine.TIMES), Home("", "wheelbase_m", Combine.TIMES)),
         words=_wheel_distance,
     ),
+    # positions, and speeds over ground, (1 + s) x what they are (a camera above measures in pixels)
+    # Taken off: positions / (1 + s)
     effect(
         "camera_scale",
         Parameter("ratio", -0.3, 0.3, 0.01, as_percent=True, is_error=True),
-        "positions, and speeds over ground, (1 + s) x what they are",
-        "a camera above measures in pixels",
         (OMNI,),
         (SPEED_X, SPEED_Y),
         "straight drives, and turns to part it from the radius of the wheels",
-        inverse=Inverse(("pose",), "positions / (1 + s)", ("position_",), Combine.OVER),
+        inverse=Inverse(("pose",), ("position_",), Combine.OVER),
         sensed_only=True,
     ),
-    # What makes a car-like robot turn otherwise than its wheels point
+    # == What makes a car-like robot turn otherwise than its wheels point
+    # d = measured angle + d0 (kinematics of a planar robot)
+    # Taken off: angle + d0
     effect(
         "steering_offset_front",
         Parameter("rad", -0.3, 0.3, 0.005),
-        "d = measured angle + d0",
-        KINEMATICS,
         (BICYCLE,),
         (GYRO, HEADING),
         "several speeds and standstill",
-        inverse=Inverse(("steering",), "angle + d0", ("angle_front_",), Combine.ADDED),
+        inverse=Inverse(("steering",), ("angle_front_",), Combine.ADDED),
     ),
+    # w = v tan d / (L + K v |v|): the front axle yields by K L / (m a) rad/N more, a the distance of the
+    # centre of mass from the rear axle (understeer gradient, Gillespie, Fundamentals of Vehicle Dynamics:
+    # tyres and compliance of the steering alike)
+    # cars have 0.001 to 0.006 s^2/m (1 to 5 deg per g over 9.8 m/s^2); soft tyres on soil more.  Below
+    # the lower bound the front axle of a light robot would be stiffer than rigid
     effect(
         "understeer",
-        # cars have 0.001 to 0.006 s^2/m (1 to 5 deg per g over 9.8 m/s^2); soft tyres on soil more.  Below
-        # the lower bound the front axle of a light robot would be stiffer than rigid
         Parameter("s2pm", -0.01, 0.1, 0.001),
-        "w = v tan d / (L + K v |v|): the front axle yields by K L / (m a) rad/N more, a the distance of the "
-        "centre of mass from the rear axle",
-        "understeer gradient, Gillespie, Fundamentals of Vehicle Dynamics: tyres and compliance of the "
-        "steering alike",
         (BICYCLE,),
         (GYRO, HEADING),
         "arcs of several speeds, to both sides",
         words=_understeer,
     ),
+    # stiffness of both axles x (1 + e); so does a load of 1 / (1 + e) - 1, with nothing else to show it
+    # (linear single-track model: Rajamani, Vehicle Dynamics and Control)
+    # load, pressure and ground: a third on loose soil of what it is on firm ground (Wong, Theory of
+    # Ground Vehicles)
     effect(
         "cornering_stiffness",
-        # load, pressure and ground: a third on loose soil of what it is on firm ground (Wong, Theory of
-        # Ground Vehicles)
         Parameter("ratio", -0.7, 2.0, 0.02, as_percent=True, is_error=True),
-        "stiffness of both axles x (1 + e); so does a load of 1 / (1 + e) - 1, with nothing else to show it",
-        SINGLE_TRACK,
         (BICYCLE,),
         (SPEED_Y, GYRO),
         "fast arcs to both sides, side slopes and steps of the steering",

@@ -120,7 +120,7 @@ def test_names_are_unique_and_entries_are_whole():
     for effect in LIBRARY:
         assert set(effect.drives) <= set(EVERY)
         assert set(effect.channels) <= set(CHANNELS)
-        assert all((effect.formula, effect.source, effect.needs))
+        assert effect.needs
         assert (effect.stage is None) == (SWERVE not in effect.drives)
         robot = ROBOTS["swerve" if SWERVE in effect.drives else effect.drives[0]]
         for p in effect.parameters:
@@ -142,12 +142,12 @@ entry = """
         "gear_wear",
         Parameter("ratio", -0.1, 0.1, 0.001, one_sided=True, scatter_rank=10, as_percent=True, is_error=True,
                   deprecated=("worn_ratio",)),
-        "x", "y", (SWERVE,), (CURRENT,), "z", True, Stage.DESCRIPTION, deprecated=("worn",),
+        (SWERVE,), (CURRENT,), "z", True, Stage.DESCRIPTION, deprecated=("worn",),
         homes=(Home("motors", "efficiency_ratio", Combine.TIMES),),
     ),
     effect(
-        "ticks", Parameter("ratio", -0.1, 0.1, 0.001), "x", "y", (SWERVE,), (SPEED_X,), "z", True, Stage.SENSORS,
-        inverse=Inverse(("wheels",), "x", undo=lambda block, e: block.values.__imul__(1.0 + e)),
+        "ticks", Parameter("ratio", -0.1, 0.1, 0.001), (SWERVE,), (SPEED_X,), "z", True, Stage.SENSORS,
+        inverse=Inverse(("wheels",), undo=lambda block, e: block.values.__imul__(1.0 + e)),
         words=lambda terms: f"wheels that count {100 * terms[0].total:.0f} % too much",
     ),
 """
