@@ -96,8 +96,15 @@ def report(result: ObserverResult) -> Report:
         f"Slip by the observer {result.filter}",
         _answer(result),
         (rows, SLIPS, f"observer {result.filter}"),
-        ("Statuses", [row.status_text for row in result.runs]),
+        ("Statuses", [_status_text(row) for row in result.runs]),
     )
+
+
+def _status_text(row: ObserverSummary) -> str:
+    times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in row.status_s.items())
+    dropped = f"; left out: {sum(row.dropped.values())} samples" if row.dropped else ""
+    missing = f"; not measured: {', '.join(row.missing)}" if row.missing else ""
+    return f"{row.run_id}: {times}{dropped}{missing}"
 
 
 def _answer(result: ObserverResult) -> str:

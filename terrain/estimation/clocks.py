@@ -13,6 +13,7 @@ import math
 from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
 
@@ -109,96 +110,41 @@ def last_stamp_s(samples: Mapping[str, Reading], stream: str) -> float:
         return math.nan
 
 
+@dataclass(slots=True)
 class _StreamClock:
-    """The clock of one stream; counts what was left out, by kind."""
+    """What is known of the clock of one stream."""
 
-    def __init__(self) -> None:
-        self.too_late = NEVER
-        self.offset_s, self.lateness_s = 0.0, 0.0
-        self.jumped = True  # a first stamp may be of any time
-        self._stamp_s = self._now_s = self._due_s = math.nan
-        self._n_due = 0
-        self.counts = {"off the clock": 0, "too late": 0, "clock set": 0}
-
-    def take(self, now_s: float, reading: Reading) -> Reading | None:
-        """Return a reading stamped by the time; None where none of it is to be believed."""
-        time_s, values = reading
-        stamps = time_s.tolist()
-        left_out = not math.isfinite(sum(stamps))
-        if left_out:
-            finite = np.isfinite(time_s)
-            time_s, values = time_s[finite], values[finite]
-            stamps = time_s.tolist()
-        if not stamps:
-            return None
-        newest_s = stamps[0] if len(stamps) == 1 else max(stamps)
-        advanced_s = newest_s - self._stamp_s  # since the reading before
-        if advanced_s < -REWIND_S or advanced_s > now_s - self._now_s + JUMP_S:
-            self.jumped, self._n_due = True, 0
-        self._stamp_s, self._now_s = newest_s, now_s
-        late_s = now_s - (newest_s - self.offset_s)
-        if -AHEAD_S <= late_s <= REWIND_S:
-            self.lateness_s, self.jumped, self._n_due = late_s, False, 0
-        elif not self.jumped or not self._agrees(now_s - newest_s):
-            is_late = not self.jumped and late_s > 0.0
-            self.counts["too late" if is_late else "off the clock"] += time_s.size
-            if is_late:
-                self.too_late = now_s, late_s
-            return None
-        if self.offset_s == 0.0:
-            return Reading(time_s, values) if left_out else reading
-        return Reading(time_s - self.offset_s, values)
-
-    def _agrees(self, behind_s: float) -> bool:
-        """Take the difference of stamps to the time anew where enough readings agree; say whether it was."""
-        if self._n_due == 0 or abs(behind_s - self._due_s) > AGREED_S:
-            self._due_s, self._n_due = behind_s, 1
-        else:
-            self._due_s, self._n_due = min(self._due_s, behind_s), self._n_due + 1
-        if self._n_due < N_AGREED:
-            return False
-        self.offset_s = -self._due_s + min(max(self.lateness_s, 0.0), REWIND_S)
-        self.jumped, self._n_due = False, 0
-        self.counts["clock set"] += 1
-        return True
+    offset_s: float = 0.0  #: of its stamps to the time
+    lateness_s: float = 0.0  #: of the last reading that was believed
+    jumped: bool = True  #: a first stamp may be of any time
+    stamp_s: float = math.nan  #: newest stamp of the reading before, and its time
+    now_s: float = math.nan
+    due_s: float = math.nan  #: a new difference to the time, and how many readings agree on it
+    n_due: int = 0
 
 
 class Clocks:
     """The time of a live chain, and the clocks of the streams.
+
+    Attributes
+    ----------
+    counts : what was not taken, and how often a clock was set, by stream and kind
+    too_late : when a reading came last that was too late to be taken, and by how much; minus infinity and NaN
 
     Examples
     --------
     >>> clocks = Clocks()
     >>> reading = Reading(np.array([0.98]), np.zeros((1, 3)))
     >>> now_s, readings = clocks.step(1.0, {"wheels": reading, "imu": "broken"})
-    >>> now_s, readings["wheels"].time_s.tolist(), clocks.counts
+    >>> now_s, readings["wheels"].time_s.tolist(), dict(clocks.counts)
     (1.0, [0.98], {'imu: unreadable': 1})
     """
 
     def __init__(self) -> None:
         self._given_s, self._offset_s, self._now_s = math.nan, 0.0, 0.0
         self._streams: dict[str, _StreamClock] = {}
-        self._unreadable: Counter[str] = Counter()
-        self.times_set = 0
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """What was not taken, and how often a clock was set, by stream and kind."""
-        counts = {
-            f"{name}: {kind}": n for name, clock in self._streams.items() for kind, n in clock.counts.items()
-        }
-        counts |= {f"{name}: unreadable": n for name, n in self._unreadable.items()}
-        return {kind: n for kind, n in (counts | {"time: clock set": self.times_set}).items() if n}
-
-    @property
-    def too_late(self) -> tuple[float, float]:
-        """When a reading came last that was too late to be taken, and by how much; minus infinity and NaN."""
-        return max((clock.too_late for clock in self._streams.values()), default=NEVER)
-
-    @property
-    def lateness_s(self) -> dict[str, float]:
-        """How late the last reading of each stream came that was taken."""
-        return {name: clock.lateness_s for name, clock in self._streams.items()}
+        self.counts: Counter[str] = Counter()
+        self.too_late = NEVER
 
     def step(self, time_s: Any, readings: Any) -> tuple[float, dict[str, Reading]]:
         """Return the time of a step, which never goes back, and what can be read of its readings.
@@ -208,38 +154,58 @@ class Clocks:
         time_s : the caller's time; a number, or anything
         readings : by stream, each a pair of stamps (k,) and values (k, c); or anything
         """
-        now_s = self._advance(number(time_s))
+        given_s = number(time_s)
+        if not abs(given_s) < 1e12:  # as if it had gone on
+            self._given_s += PERIOD_S
+            self._now_s += PERIOD_S
+        else:
+            step_s = given_s - self._given_s
+            if not math.isnan(step_s) and not 0.0 <= step_s <= LONGEST_STEP_S:
+                self._offset_s = given_s - (self._now_s + PERIOD_S)
+                self.counts["time: clock set"] += 1
+                for clock in self._streams.values():
+                    clock.jumped = True
+            self._given_s, self._now_s = given_s, given_s - self._offset_s
         taken: dict[str, Reading] = {}
-        if type(readings) is not dict and not isinstance(readings, Mapping):
-            return now_s, taken
-        for name, given in readings.items():
+        for name, given in readings.items() if isinstance(readings, Mapping) else ():
             reading = readable(given)
             if reading is None:
-                self._unreadable[str(name)] += 1
-                continue
-            clock = self._streams.get(name)
-            if clock is None:
-                clock = self._streams[name] = _StreamClock()
-            believed = clock.take(now_s, reading)
-            if believed is not None:
+                self.counts[f"{name}: unreadable"] += 1
+            elif (believed := self._believed(name, reading)) is not None:
                 taken[name] = believed
-        return now_s, taken
+        return self._now_s, taken
 
-    def _advance(self, given_s: float) -> float:
-        """Return the time of a step: what was given, less all steps of its clock."""
-        if not abs(given_s) < 1e12:
-            self._given_s += PERIOD_S  # as if it had gone on
-            self._now_s += PERIOD_S
-            return self._now_s
-        step_s = given_s - self._given_s
-        if not math.isnan(step_s) and not 0.0 <= step_s <= LONGEST_STEP_S:
-            self._offset_s = given_s - (self._now_s + PERIOD_S)
-            self.times_set += 1
-            for clock in self._streams.values():
-                clock.jumped = True
-        self._given_s = given_s
-        self._now_s = given_s - self._offset_s
-        return self._now_s
+    def _believed(self, name: str, reading: Reading) -> Reading | None:
+        """Return a reading of a stream stamped by the time; None where none of it is to be believed."""
+        clock, now_s = self._streams.setdefault(name, _StreamClock()), self._now_s
+        finite = np.isfinite(reading.time_s)
+        if not finite.all():
+            reading = Reading(reading.time_s[finite], reading.values[finite])
+        if not reading.time_s.size:
+            return None
+        newest_s = float(reading.time_s.max())
+        advanced_s = newest_s - clock.stamp_s  # since the reading before
+        if advanced_s < -REWIND_S or advanced_s > now_s - clock.now_s + JUMP_S:
+            clock.jumped, clock.n_due = True, 0
+        clock.stamp_s, clock.now_s = newest_s, now_s
+        behind_s, late_s = now_s - newest_s, now_s - (newest_s - clock.offset_s)
+        if -AHEAD_S <= late_s <= REWIND_S:
+            clock.lateness_s, clock.jumped, clock.n_due = late_s, False, 0
+        elif not clock.jumped:
+            self.counts[f"{name}: {'too late' if late_s > 0.0 else 'off the clock'}"] += reading.time_s.size
+            self.too_late = (now_s, late_s) if late_s > 0.0 else self.too_late
+            return None
+        else:
+            agrees = clock.n_due > 0 and abs(behind_s - clock.due_s) <= AGREED_S
+            clock.due_s = min(clock.due_s, behind_s) if agrees else behind_s
+            clock.n_due = clock.n_due + 1 if agrees else 1
+            if clock.n_due < N_AGREED:
+                self.counts[f"{name}: off the clock"] += reading.time_s.size
+                return None
+            clock.offset_s = -clock.due_s + min(max(clock.lateness_s, 0.0), REWIND_S)
+            clock.jumped, clock.n_due = False, 0
+            self.counts[f"{name}: clock set"] += 1
+        return reading if clock.offset_s == 0.0 else Reading(reading.time_s - clock.offset_s, reading.values)
 
 
 class SessionClock:
@@ -299,12 +265,7 @@ class ClockWatch:
     def __init__(self) -> None:
         self._newest_s: dict[str, float] = {}
         self._n_behind: dict[str, int] = {}
-        self.times_set = 0
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """How often the clock was set, as :attr:`Clocks.counts`; empty where it was not."""
-        return {"time: clock set": self.times_set} if self.times_set else {}
+        self.counts: Counter[str] = Counter()  # how often the clock was set, as those of `Clocks`
 
     def was_set(self, samples: Mapping[str, Reading]) -> bool:
         """Take the stamps of readings; say whether they are of a clock that was set since the call before."""
@@ -320,7 +281,7 @@ class ClockWatch:
             if self._n_behind[stream] >= N_BEHIND:
                 self._newest_s.clear()
                 self._n_behind.clear()
-                self.times_set += 1
+                self.counts["time: clock set"] += 1
                 return True
         return False
 

@@ -124,14 +124,6 @@ class ObserverSummary:
     missing: tuple[str, ...]  #: what the observer takes and the run never has
     finite: bool  #: whether positions are finite once the observer has started, and nothing is infinite
 
-    @property
-    def status_text(self) -> str:
-        """How long the observer had which status, what was left out and what was not measured, in words."""
-        times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in self.status_s.items())
-        dropped = f"; left out: {sum(self.dropped.values())} samples" if self.dropped else ""
-        missing = f"; not measured: {', '.join(self.missing)}" if self.missing else ""
-        return f"{self.run_id}: {times}{dropped}{missing}"
-
 
 def summarize_observer(found: ObserverEstimate) -> ObserverSummary:
     """Return the figures of an estimate."""
