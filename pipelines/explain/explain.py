@@ -134,13 +134,7 @@ def explain(
     from pipelines.explain.statements import notes_of, statements_of
     from pipelines.report.results import silent
     from terrain.discrepancy.compared import terrains_apart
-    from terrain.discrepancy.diagnosed_runs import (
-        check_robots,
-        diagnose_runs,
-        extended_effects,
-        held_out_gain,
-        runs_of_terrain,
-    )
+    from terrain.discrepancy.diagnosed_runs import chosen_runs, diagnose_runs, extended_effects, held_out_gain
     from terrain.discrepancy.next_drive import next_command
     from terrain.discrepancy.powertrain import powertrain_of
     from terrain.discrepancy.robot_terms import in_robot_terms
@@ -154,8 +148,7 @@ def explain(
     description = description or robot.name
     names, seed = asked.effects, asked.seed
     library = showing(robot.drive, robot.effects) if names is None else chosen_effects(robot.drive, names)
-    chosen = runs_of_terrain(runs, asked.terrain)
-    check_robots(chosen, robot)
+    chosen = chosen_runs(runs, robot, asked.terrain)
     diagnosed = diagnose_runs(chosen, robot, library, asked.hold_out, seed)
     progress("diagnose", 1, 1)
     gained = held_out_gain(diagnosed, robot, seed)

@@ -284,39 +284,26 @@ def simulation_for(
     return replace(simulation, grounds=grounds), tuple(matches)
 
 
-def runs_of_terrain(runs: Sequence[RunLog], terrain: str | None) -> list[RunLog]:
+def chosen_runs(runs: Sequence[RunLog], robot: Robot, terrain: str | None) -> list[RunLog]:
     """Return the runs that are of one label throughout; all of them where none is asked for.
 
     Raises
     ------
     DataError
-        if there is no such run.
+        if there is no such run, or if some are of another robot.
     """
     if not runs:
         raise DataError("there is no run to explain")
     chosen = [run for run in runs if terrain is None or run.terrains == (terrain,)]
     if not chosen:
-        labels = sorted({name for run in runs for name in run.terrains})
+        labels = ", ".join(sorted({name for run in runs for name in run.terrains})) or "none"
+        raise DataError(f"no run is labelled {terrain!r} throughout; labels are {labels}")
+    others = Counter(run.robot for run in chosen if run.robot != robot.name)
+    for name, n in others.most_common(1):
         raise DataError(
-            f"no run is labelled {terrain!r} throughout; labels are {', '.join(labels) if labels else 'none'}"
+            f"{n} of {len(chosen)} runs are of the robot {name!r}; the simulation is of {robot.name!r}"
         )
     return chosen
-
-
-def check_robots(runs: Sequence[RunLog], robot: Robot) -> None:
-    """Make sure that all runs are of the robot.
-
-    Raises
-    ------
-    DataError
-        if some are of another.
-    """
-    others = Counter(run.robot for run in runs if run.robot != robot.name)
-    if others:
-        (name, n), *_ = others.most_common(1)
-        raise DataError(
-            f"{n} of {len(runs)} runs are of the robot {name!r}; the simulation is of {robot.name!r}"
-        )
 
 
 def best_ratio(losses: Array) -> tuple[float, float]:

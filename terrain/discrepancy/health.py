@@ -300,14 +300,13 @@ def _words(change: Change, robot: Robot) -> tuple[str, str]:
             what = "wheel speeds of {} and {} are exchanged".format(*(robot.wheels[i] for i in change.pair))
         return what, f"exchange {names} (mapping file: exchange their columns)"
     if change.kind is FaultKind.OFFSET:
-        size = f"{-change.offset:.3g} {kind.si}"
-        repair = (
-            f"subtract {size} from {logged.split(' and ')[0]} (mapping file: offset: {change.offset:.3g})"
-        )
-        return f"{name} has an offset of {size}", repair
+        size, first = f"{-change.offset:.3g} {kind.si}", logged.split(" and ")[0]
+        hint = f"mapping file: offset: {change.offset:.3g}"
+        return f"{name} has an offset of {size}", f"subtract {size} from {first} ({hint})"
     hint = f"scale: {change.factor:.4g}"
     if change.kind is FaultKind.SIGN:
-        what, hint = f"the sign of {name} is turned" if several else f"{name}'s sign is turned", "scale: -1"
+        what = f"the sign of {name} is turned" if several else f"{name}'s sign is turned"
+        hint = "scale: -1"
         if change.wheel >= 0:
             wheel = robot.wheels[change.wheel]
             what, logged = (
@@ -581,9 +580,7 @@ def _unit_faults(runs: Sequence[Rows], robot: Robot) -> tuple[Fault, ...]:
             seen += f"; another reading is as good ({' or '.join(words)})"
         fault = _fault(change, has, ids, seen, robot)
         measured = [each for some in (reading, *rivals) for each in some if not each.of_wheels]
-        if (
-            not rivals or not measured
-        ):  # of the wheels in either case: without them there is nothing to compare
+        if not rivals or not measured:  # without wheels there is nothing to compare
             return fault
         left_out = f"{KINDS[measured[0].column].logged} is left out; state the units that the logger has"
         sentence = f"{fault.sentence.removesuffix(f'; {fault.repair}')}, so that {left_out}"
@@ -628,12 +625,11 @@ def options_of(logs: Array, robot: Robot) -> Options:
     for column, kind in KINDS.items():
         rates = [robot.wheel_radius_m] if column is Column.WHEELS else []  # of wheels in the place of speeds
         if rates or known & {*kind.channels}:
-            for factor in (
-                factor for size in (*kind.units.values(), *rates) for factor in (size, 1.0 / size)
-            ):
+            by = [float(c in kind.channels) for c in KEYS]
+            if rates:
+                by = [math.nan if c == AMPS else -1.0 for c in KEYS]
+            for factor in np.ravel([(size, 1.0 / size) for size in (*kind.units.values(), *rates)]).tolist():
                 single.append(Change(FaultKind.UNIT, column, factor))
-                by_wheels = [math.nan if c == AMPS else -1.0 for c in KEYS]
-                by = by_wheels if rates else [1.0 if c in kind.channels else 0.0 for c in KEYS]
                 adds.append(math.log(factor) * np.array(by))
     measured = [i for i, change in enumerate(single) if not change.of_wheels]
     pairs = [(i, j) for i, j in combinations(measured, 2) if single[i].column is not single[j].column]

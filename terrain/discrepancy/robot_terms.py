@@ -58,8 +58,14 @@ def in_robot_terms(effect: str, values: Sequence[Value], robot: Robot) -> str:
     words, terms, plain = effect_named(effect).words, [], []
     for value in values:
         total, half = robot.effects.get(value.name, 0.0) + value.value, (value.high - value.low) / 2.0
-        basis = next(iter(basis_of(robot, value.name, total)), None)
-        about = (0.0, total, "") if basis is None else (basis.described, basis.extended, described_as(basis))
+        about, basis = (0.0, total, ""), next(iter(basis_of(robot, value.name, total)), None)
+        if basis is not None:
+            # the number of the description beside which the value stands, and whether it is assumed
+            unit, note = basis.field.rpartition("_")[2], "(not described)"
+            if basis.origin is not Origin.LEFT_OUT:
+                number = f"{basis.described:.3g} {UNITS.get(unit, unit)}".strip()
+                note = f"(described: {number}{', assumed' if basis.origin is Origin.ASSUMED else ''})"
+            about = basis.described, basis.extended, note
         terms.append(Term(value.value, half, total, *about, robot))
         plain.append(_plain_words(value.name, terms[-1], basis))
     return " and ".join(plain) if words is None else words(terms)
@@ -155,22 +161,6 @@ def limit_text(limit: Limit, missed: bool) -> str:
 def listed(words: Sequence[str], last: str = "and") -> str:
     """Return words as a sentence lists them."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
-
-
-def described_as(basis: Basis) -> str:
-    """Return the number of the description beside which a value stands, and whether it is assumed.
-
-    Examples
-    --------
-    >>> from terrain.robots import load_robot
-    >>> described_as(basis_of(load_robot("husky"), "lever_x_m", -0.25)[0])
-    '(described: 0.35 m, assumed)'
-    """
-    if basis.origin is Origin.LEFT_OUT:
-        return "(not described)"
-    unit = basis.field.rpartition("_")[2]
-    number = f"{basis.described:.3g} {UNITS.get(unit, unit)}".strip()
-    return f"(described: {number}{', assumed' if basis.origin is Origin.ASSUMED else ''})"
 
 
 def _plain_words(name: str, term: Term, basis: Basis | None) -> str:

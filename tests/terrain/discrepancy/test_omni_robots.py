@@ -63,11 +63,11 @@ def values_of(diagnosis):
     [
         {},
         {"roller_friction_ratio": 0.1},
-        {"load_shift_x_m": 0.012, "load_shift_y_m": -0.006},
+        pytest.param({"load_shift_x_m": 0.012, "load_shift_y_m": -0.006}, marks=pytest.mark.slow),
         {"wheel_distance_ratio": 0.06},
         pytest.param({"camera_yaw_rad": 0.05}, marks=pytest.mark.slow),
         pytest.param({"camera_latency_s": 0.12}, marks=pytest.mark.slow),
-        {"force_slip_ratio": 0.4},
+        pytest.param({"force_slip_ratio": 0.4}, marks=pytest.mark.slow),
         {"camera_scale_ratio": -0.08},
         pytest.param({"lever_x_m": 0.05, "lever_y_m": 0.02}, marks=pytest.mark.slow),
     ],
@@ -82,28 +82,16 @@ def test_a_hidden_effect_is_named_with_its_value_and_nothing_beside_it(hidden):
         assert values[name].low - 0.1 * abs(size) < size < values[name].high + 0.1 * abs(size), name
 
 
-def on_straight_drives(change=lambda run: run):
-    """Return the causes and sets of four trials with a scaled camera, which do not turn."""
-    for seed in range(4):
-        runs = driven({"camera_scale_ratio": -0.08}, FREE, turns=False, seed=seed)
-        diagnosis = diagnosed([change(run) for run in runs], FREE)
-        yield [cause.name for cause in diagnosis.causes], [set(names) for names in diagnosis.ambiguous_sets]
-
-
-ONE, BOTH = (["camera_scale"], []), ([], [{"camera_scale", "wheel_radius"}])
-
-
 def test_scale_of_a_camera_and_radius_of_the_wheels_are_one_on_straight_drives():
     """Only the torque of a larger wheel parts them: the answer is the scale, or either."""
-    answers = [*on_straight_drives()]
-    assert all(answer in (ONE, BOTH) for answer in answers)
-    assert BOTH in answers
-
-
-@pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="a smaller radius predicts less of the encoders' noise in the heading")
-def test_without_currents_straight_drives_do_not_part_scale_and_radius():
-    assert all(answer == BOTH for answer in on_straight_drives(lambda run: without_channels(run, "current_")))
+    answers, both = [], ([], [{"camera_scale", "wheel_radius"}])
+    while both not in answers and len(answers) < 4:
+        runs = driven({"camera_scale_ratio": -0.08}, FREE, turns=False, seed=len(answers))
+        diagnosis = diagnosed(runs, FREE)
+        sets = [set(names) for names in diagnosis.ambiguous_sets]
+        answers.append(([cause.name for cause in diagnosis.causes], sets))
+        assert answers[-1] in ((["camera_scale"], []), both)
+    assert both in answers
 
 
 @pytest.fixture(scope="module")

@@ -236,8 +236,7 @@ def odd(compared):
     return odd_runs(compared, agreement_of(compared), range(len(compared)))
 
 
-@pytest.mark.parametrize("scatter", [0.1, 0.35])
-@pytest.mark.parametrize("n", [6, 40])
+@pytest.mark.parametrize(("n", "scatter"), [(6, 0.35), (40, 0.1)])
 def test_runs_that_scatter_have_no_outlier_and_none_stalls(n, scatter):
     compared = responses(runs_of(n, scatter))
     assert odd(compared) == {}

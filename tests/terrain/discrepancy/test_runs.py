@@ -1,4 +1,4 @@
-"""Measured, predicted and sensitivities behind one low-pass."""
+"""From streams to one clock, and behind one low-pass: what a run measures comes through, the rest stays unknown."""
 
 from dataclasses import replace
 
@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from terrain.discrepancy.compared import binned_means, noise_spectrum, run_means, spectrum
 from terrain.discrepancy.evidence import evidence_at
-from terrain.discrepancy.noise import noise_of
 from terrain.discrepancy.runs import (
+    PARALLEL,
     SETTLE_S,
     Signals,
     Simulation,
@@ -20,14 +19,29 @@ from terrain.discrepancy.runs import (
     rows_of,
     signals_of,
 )
-from terrain.effects import CHANNELS, INDEX, ONE_SIDED, SPEED_X, STEPS, vector_of
+from terrain.effects import (
+    ACCEL,
+    CHANNELS,
+    CURRENT,
+    GYRO,
+    HEADING,
+    INDEX,
+    ONE_SIDED,
+    SPEED_X,
+    SPEED_Y,
+    STEPS,
+    TURNING_CURRENT,
+    vector_of,
+)
 from terrain.errors import DataError
+from terrain.records import Label, Stream
 from terrain.robots import load_robot
 from terrain.simulation.plants.planar import Ground, replay, spread_numbers
 from terrain.simulation.run import simulate
 from terrain.simulation.scenario import Conditions
 
-ROBOTS = {"husky": load_robot("husky"), "agrimaro": load_robot("agrimaro")}
+HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
+ROBOTS = {"husky": HUSKY, "agrimaro": AGRIMARO}
 HIDDEN = {
     "husky": {
         "payload_ratio": 0.2,
@@ -46,12 +60,184 @@ NOISE = np.array([0.01, 0.005, 0.005, 0.1, 1.0, 1.0, 0.02])
 """About what sensors of these robots show of nothing."""
 
 
+# -- From streams to signals on one clock ------------------------------------------------------------------
+
+
+def labelled_drive(robot, **options):
+    t = np.arange(1001) / 50
+    twist = np.column_stack([0.4 * np.sin(0.8 * t), np.zeros_like(t), 0.3 * np.sin(1.1 * t)])
+    if robot is AGRIMARO:
+        twist[:, 1] = 0.2 * np.sin(0.5 * t)
+    return simulate(
+        robot,
+        twist,
+        Ground(),
+        1,
+        terrain="grass",
+        conditions=Conditions(grade_ratio=(0.05, 0.0), undulation_ratio=0.02),
+        **options,
+    )
+
+
+@pytest.fixture(scope="module")
+def husky():
+    return labelled_drive(HUSKY, heading=True)
+
+
+@pytest.fixture(scope="module")
+def agrimaro():
+    return labelled_drive(AGRIMARO)
+
+
+def channel(signals, name):
+    return signals.measured[:, CHANNELS.index(name)]
+
+
+def with_stream(run, name, stream):
+    streams = {key: value for key, value in run.streams.items() if key != name}
+    return replace(run, streams=streams if stream is None else {**streams, name: stream})
+
+
+def kept(stream, rows):
+    return Stream(stream.time_s[rows], stream.values[rows], stream.channels)
+
+
+def test_streams_of_a_skid_steer_robot_are_resampled_to_one_clock(husky):
+    signals = signals_of(husky, HUSKY)
+    wheels, imu, seen = (husky.streams[name] for name in ("wheels", "imu", "odometry"))
+    assert (signals.run_id, signals.terrain, signals.dt_s, len(signals)) == ("run", "grass", 0.02, 1001)
+    assert_allclose(signals.time_s, wheels.time_s)
+    assert_array_equal(signals.wheel_speed_mps, wheels.values[:, :2])
+    assert not signals.steer_rad.any()
+    left, right = wheels.values[:, 2:].T
+    for shown, logged in (
+        (signals.grade_rad, -imu.channel("pitch_rad")[::2]),
+        (signals.roll_rad, imu.channel("roll_rad")[::2]),
+        (channel(signals, GYRO), imu.channel("gyro_z_radps")[::2]),
+        (channel(signals, ACCEL), imu.channel("accel_x_mps2")[::2]),
+        (channel(signals, SPEED_X), seen.values[:, 0]),
+        (channel(signals, SPEED_Y), seen.values[:, 1]),
+        (channel(signals, HEADING), husky.streams["lidar"].values[:, 0]),
+        (channel(signals, CURRENT), left + right),
+        (channel(signals, TURNING_CURRENT), right - left),
+    ):
+        assert_allclose(shown, logged, atol=1e-12)
+    with pytest.raises(ValueError, match="read-only"):
+        signals.measured[0, 0] = 1.0
+
+
+def test_a_tracking_camera_measures_the_speed_of_its_own_point_in_body_axes(agrimaro):
+    signals, truth, camera = signals_of(agrimaro, AGRIMARO), agrimaro.streams["truth"], AGRIMARO.camera
+    late_s = signals.time_s - camera.latency_s - camera.time_constant_s
+    x, y, turn = (
+        np.interp(late_s, truth.time_s, truth.channel(name))
+        for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
+    )
+    # straight lines between samples of the truth
+    assert_allclose(channel(signals, SPEED_X), x - camera.lever_y_m * turn, atol=2e-3)
+    assert_allclose(channel(signals, SPEED_Y), y + camera.lever_x_m * turn, atol=2e-3)
+    assert np.isnan(channel(signals, HEADING)).all()
+
+
+def test_steering_zeros_and_turns_are_subtracted_and_motor_rates_become_wheel_speeds(agrimaro):
+    signals, truth = signals_of(agrimaro, AGRIMARO), agrimaro.streams["truth"]
+    wheels, steering = agrimaro.streams["wheels"], agrimaro.streams["steering"]
+    expected = np.column_stack([truth.channel(f"steer_{i}_rad")[::2] for i in (1, 2, 3)])
+    per_motor = AGRIMARO.wheel_radius_m / AGRIMARO.motors.reduction_ratio
+    turned = replace(steering, values=np.angle(np.exp(1j * (steering.values + 2 * np.pi))))
+    for run in (agrimaro, with_stream(agrimaro, "steering", turned)):
+        assert_allclose(signals_of(run, AGRIMARO).steer_rad, expected, atol=1e-9)
+    assert_allclose(signals.wheel_speed_mps, wheels.values[:, :3] * per_motor)
+    parallel = (
+        np.abs(np.exp(1j * signals.steer_rad).mean(axis=1)) > PARALLEL
+    )  # else no sum of currents counts
+    assert 0.1 < parallel.mean() < 0.9
+    assert_array_equal(np.isfinite(channel(signals, CURRENT)), parallel)
+    assert np.isnan(channel(signals, TURNING_CURRENT)).all()
+
+
+def test_current_magnitudes_get_the_sign_of_their_wheel_and_signed_ones_stay():
+    # on the spot: the sides turn against each other, and both motors drive
+    t = np.arange(1001) / 50
+    twist = np.column_stack([np.zeros_like(t), np.zeros_like(t), 0.8 * np.minimum(t, 1.0)])
+    run = simulate(HUSKY, twist, Ground(), 1, terrain="grass")
+    wheels = run.streams["wheels"]
+    values = np.array(wheels.values)
+    at = [wheels.channels.index(f"current_{side}_a") for side in ("left", "right")]
+    values[:, at] = np.abs(values[:, at])
+    sizes = with_stream(run, "wheels", Stream(wheels.time_s, values, wheels.channels))
+    signed, restored = signals_of(run, HUSKY), signals_of(sizes, HUSKY)
+    steady = signed.time_s > 2.0
+    assert_allclose(channel(restored, TURNING_CURRENT)[steady], channel(signed, TURNING_CURRENT)[steady])
+    assert channel(restored, TURNING_CURRENT)[steady].mean() > 1.0
+    braked = np.array(values)
+    braked[500, at[0]] = -0.1  # one sample below zero: the motor driver logs signs
+    logged = signals_of(with_stream(run, "wheels", Stream(wheels.time_s, braked, wheels.channels)), HUSKY)
+    assert abs(channel(logged, TURNING_CURRENT)[steady].mean()) < 0.1
+
+
+def test_long_holes_stay_holes_and_short_ones_are_bridged(husky):
+    seen, wheels, imu = (husky.streams[name] for name in ("odometry", "wheels", "imu"))
+    lost = (seen.time_s > 5.0) & (seen.time_s < 7.0)
+    short = (seen.time_s > 9.995) & (seen.time_s < 10.025)
+    blank = wheels.values.copy()
+    blank[(wheels.time_s > 12.0) & (wheels.time_s < 13.0), 0] = np.nan
+    run = with_stream(husky, "odometry", kept(seen, ~lost & ~short))
+    run = with_stream(run, "wheels", replace(wheels, values=blank))
+    signals = signals_of(
+        with_stream(run, "imu", replace(imu, values=np.full_like(imu.values, np.nan))), HUSKY
+    )
+    time_s, known = signals.time_s, np.isfinite(channel(signals, SPEED_X))
+    assert_array_equal(known, ~((time_s > 5.0 + 1e-9) & (time_s < 7.0 - 1e-9)))
+    assert_allclose(channel(signals, SPEED_X)[known], seen.values[known, 0], atol=1e-3)
+    silent = (time_s > 12.0) & (time_s < 13.0 - 1e-9)
+    assert_array_equal(np.isfinite(signals.wheel_speed_mps), np.column_stack([~silent, silent | True]))
+    assert np.isnan(channel(signals, GYRO)).all()
+
+
+def test_what_is_slow_late_or_not_there_sets_the_clock_and_what_is_known(husky):
+    slow, imu = kept(husky.streams["wheels"], slice(None, None, 5)), husky.streams["imu"]
+    late = kept(imu, slice(300, 1500))
+    signals = signals_of(with_stream(with_stream(husky, "wheels", slow), "imu", late), HUSKY)
+    assert (signals.dt_s, signals.start_s, len(signals)) == pytest.approx((0.1, 3.0, 120))
+    gyro = Stream(imu.time_s, imu.values[:, 2:4], imu.channels[2:4])
+    labels = Label(0.0, 9.0, "grass"), Label(9.0, 20.0, "gravel")
+    signals = signals_of(replace(with_stream(husky, "imu", gyro), labels=labels), HUSKY)
+    assert signals.terrain == ""
+    assert np.isnan(channel(signals, ACCEL)).all()
+    assert np.isfinite(channel(signals, GYRO)).all()
+    assert not signals.grade_rad.any()
+
+
+def test_a_run_that_cannot_be_compared_is_refused_in_one_sentence(husky, agrimaro):
+    wheels, imu = husky.streams["wheels"], husky.streams["imu"]
+    short = replace(husky, streams={name: kept(s, s.time_s < 3.0) for name, s in husky.streams.items()})
+    apart = with_stream(husky, "imu", replace(imu, time_s=imu.time_s + 30.0))
+    side, speeds = (Stream(wheels.time_s, wheels.values[:, :n], wheels.channels[:n]) for n in (1, 2))
+    for run, robot, message in (
+        (husky, AGRIMARO, "is of the robot 'husky', the simulation is of 'agrimaro'"),
+        (with_stream(husky, "wheels", None), HUSKY, "no stream 'wheels'"),
+        (with_stream(agrimaro, "steering", None), AGRIMARO, "no stream 'steering'"),
+        (with_stream(husky, "wheels", side), HUSKY, "a speed of each of left, right is required"),
+        (short, HUSKY, "have 3.0 s in common, at least 4 s"),
+        (apart, HUSKY, "have 0.0 s in common"),
+        (replace(husky, streams={"wheels": speeds}), HUSKY, "none of its channels is simulated"),
+    ):
+        with pytest.raises(DataError) as error:
+            signals_of(run, robot)
+        assert message in str(error.value)
+        assert "\n" not in str(error.value)
+
+
+# -- From signals to rows behind one low-pass --------------------------------------------------------------
+
+
 def drive(robot, effects):
     t = np.arange(1501) / 50
     start = np.minimum(t, 1.0)
     speed = 0.5 * np.sin(0.8 * t) + 0.2 * np.sin(1.9 * t)
     twist = np.column_stack([speed, np.zeros_like(t), 0.3 * np.sin(1.1 * t)]) * start[:, None]
-    if robot is ROBOTS["agrimaro"]:
+    if robot is AGRIMARO:
         twist[:, 0] += 0.7 * start  # where it stops, its steering turns in no time
     return simulate(
         robot,
@@ -59,7 +245,7 @@ def drive(robot, effects):
         Ground(),
         1,
         effects=effects,
-        heading=robot is ROBOTS["husky"],
+        heading=robot is HUSKY,
         conditions=Conditions(grade_ratio=(0.05, 0.02), undulation_ratio=0.02),
     )
 
@@ -194,7 +380,7 @@ def test_the_slowest_clock_sets_the_low_pass_whichever_run_has_it():
 
 def test_noise_of_the_wheels_is_not_attributed_to_a_mass_or_a_motor():
     """At one speed the wheels' acceleration is all noise, in the residual and in what a mass would change."""
-    robot = ROBOTS["agrimaro"]
+    robot = AGRIMARO
     time_s = np.arange(2001) / 50
     twist = np.zeros((time_s.size, 3))
     twist[:, 0] = np.clip(0.5 * time_s, 0.0, 0.7)
@@ -226,68 +412,6 @@ def test_the_start_of_a_short_run_is_kept_where_it_begins_in_steady_motion(secon
     wheel_speed[:, 0] += 0.3 * np.clip(run.time_s / 0.3, 0.0, 1.0) * moving
     low_pass = low_pass_of([run])
     cut = replace(run, wheel_speed_mps=wheel_speed)
-    rows = rows_of(cut, Simulation(ROBOTS["husky"]).planar, vector_of({}), (), low_pass)
+    rows = rows_of(cut, Simulation(HUSKY).planar, vector_of({}), (), low_pass)
     centre_s = low_pass.taps.size // 2 * cut.dt_s * max(low_pass.inputs_every, 1)
     assert rows.time_s[0] == pytest.approx(centre_s + lost_s, abs=1.0 / low_pass.rate_hz)
-
-
-# -- Spectra of residuals, and their means with intervals --------------------------------------------------
-
-RATE_HZ = 6.25
-
-
-def coloured(n, seed, keep=0.7):
-    white = np.random.default_rng(seed).standard_normal(n)
-    for i in range(1, n):
-        white[i] += keep * white[i - 1]
-    return white
-
-
-def test_the_spectrum_of_coloured_noise_is_that_of_the_filter_that_whitens_it():
-    """Two routes: averaged periodograms, and the fitted autoregression; both hold the variance."""
-    residuals = [coloured(4000, seed) for seed in range(8)]
-    noise = noise_of([r[:, None] for r in residuals], [np.ones(4000)] * 8, 0.2, 0)
-    frequency, power = spectrum(residuals, RATE_HZ)
-    fitted = noise.size(np.ones(1))[0, 0] ** 2 * noise_spectrum(noise.filters[0], frequency, RATE_HZ)
-    inner = slice(1, -1)
-    # 8 x 124 segments, half of them overlapping: 5 % of scatter in a bin, four times that allowed
-    np.testing.assert_allclose(power[inner], fitted[inner], rtol=0.2)
-    fine = np.linspace(0, RATE_HZ / 2, 4000)
-    held = noise_spectrum(noise.filters[0], fine, RATE_HZ).mean() * RATE_HZ / 2
-    assert held == pytest.approx(1.0, rel=0.05)
-
-
-def test_a_hole_splits_a_spectrum_and_short_runs_use_short_segments():
-    whole = coloured(2000, 1)
-    holed = np.concatenate([whole[:1000], [np.nan], whole[1000:]])
-    parts = spectrum([whole[:1000], whole[1000:]], RATE_HZ)
-    assert_allclose(spectrum([holed], RATE_HZ)[1], parts[1])
-    assert np.isnan(spectrum([whole[:7]], RATE_HZ)[1]).all()
-    white = np.random.default_rng(3).standard_normal(40 * 300)
-    frequency, power = spectrum([*np.split(white, 300), np.full(5, np.nan)], RATE_HZ)
-    assert_allclose(frequency, np.fft.rfftfreq(32, 1 / RATE_HZ)[1:])
-    assert_allclose(power[:-1], 2.0 / RATE_HZ, rtol=0.3)
-    assert spectrum([*np.split(white, 300), white], RATE_HZ)[0][0] == pytest.approx(RATE_HZ / 64)
-
-
-def test_intervals_of_zero_mean_noise_have_their_nominal_coverage():
-    n_seeds, missed_runs, missed_bins = 60, [], []
-    for seed in range(n_seeds):
-        residuals = [coloured(400, 1000 * seed + i) for i in range(6)]
-        mean, half = run_means(residuals, [np.ones(400)] * 6, np.array([1.0, -0.7]))
-        missed_runs.extend(np.abs(mean) > half)
-        ramps = [np.linspace(0, 1, 400)] * 6
-        _, means, halves = binned_means(ramps, residuals)
-        missed_bins.extend(np.abs(means) > halves)
-    # 360 of either; bins of one seed have little in common
-    assert 0.02 < np.mean(missed_runs) < 0.09
-    assert 0.02 < np.mean(missed_bins) < 0.09
-
-
-def test_bins_require_rows_and_intervals_require_runs():
-    x = np.linspace(0, 1, 200)
-    centres, means, halves = binned_means([x, x], [np.ones(200), np.full(200, np.nan)])
-    assert len(centres) == 6
-    assert np.isnan(halves).all()
-    assert_allclose(means, 1.0)
-    assert binned_means([np.full(9, np.nan)], [np.ones(9)])[0].size == 0
