@@ -10,14 +10,13 @@ from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
 from terrain.discrepancy.compared import (
     CHANNEL_WORDS,
     INPUT_LABELS,
-    MIN_SPREAD,
     ComparedRun,
     binned_means,
     noise_spectrum,
     run_means,
     spectrum,
-    spread_of,
     strongest_input,
+    varying_inputs,
 )
 from terrain.discrepancy.constancy import PartValues
 from terrain.discrepancy.noise import Noise
@@ -65,13 +64,10 @@ def dependence_figures(runs: Sequence[ComparedRun], noise: Noise) -> tuple[Figur
         c, axis = CHANNELS.index(name), AXIS.format(*CHANNEL_WORDS[name])
         residuals, most = [*_residuals(runs, c)], strongest_input(runs, name)
         panels = {}
-        for key in runs[0].inputs:
-            if key == most or spread_of(runs, key) > MIN_SPREAD:
-                given = [run.inputs[key] for run in runs]
-                marks = [
-                    _points(kind, colour, *binned_means(given, left)) for kind, colour, left in residuals
-                ]
-                panels[key] = Panel(marks, axis, x_label=INPUT_LABELS[key])
+        for key in varying_inputs(runs):
+            given = [run.inputs[key] for run in runs]
+            marks = [_points(kind, colour, *binned_means(given, left)) for kind, colour, left in residuals]
+            panels[key] = Panel(marks, axis, x_label=INPUT_LABELS[key])
         strongest.append(panels[most])
         at, sizes = np.arange(1.0, len(runs) + 1), [noise.size(run.pace_mps)[:, c] for run in runs]
         marks = []

@@ -121,25 +121,24 @@ def telling_runs(runs: Sequence[ComparedRun], noise: Noise, n: int) -> list[Comp
     return [runs[i] for i in order[places]]
 
 
+def varying_inputs(runs: Sequence[ComparedRun]) -> list[str]:
+    """Return the inputs that vary over all runs, outliers left out; the time where none does."""
+    names = []
+    for name in runs[0].inputs:
+        low, high = input_range([run.inputs[name] for run in runs])
+        if high - low > MIN_SPREAD:
+            names.append(name)
+    return names or ["time_s"]
+
+
 def strongest_input(runs: Sequence[ComparedRun], channel: str) -> str:
     """Return the input over whose bins the mean residual of a channel, before, is largest beyond its error."""
-    strongest, most, c = "time_s", -math.inf, CHANNELS.index(channel)
-    for name in runs[0].inputs:
-        if spread_of(runs, name) > MIN_SPREAD:
-            means = binned_means(
-                [run.inputs[name] for run in runs], [run.residual(False)[:, c] for run in runs]
-            )
-            error = np.nan_to_num(means.half_interval) / 1.96
-            size = float(np.mean(means.mean**2 - error**2)) if means.mean.size else -math.inf
-            if size > most:
-                strongest, most = name, size
-    return strongest
-
-
-def spread_of(runs: Sequence[ComparedRun], name: str) -> float:
-    """Return the range of an input over all runs, outliers left out; 0 where it is not known."""
-    low, high = input_range([run.inputs[name] for run in runs])
-    return high - low
+    residuals, sizes = [run.residual(False)[:, CHANNELS.index(channel)] for run in runs], {}
+    for name in varying_inputs(runs):
+        _, mean, half = binned_means([run.inputs[name] for run in runs], residuals)
+        error = np.nan_to_num(half) / 1.96
+        sizes[name] = float(np.mean(mean**2 - error**2)) if mean.size else -math.inf
+    return max(sizes, key=sizes.__getitem__)
 
 
 def without_levels(noise: Noise, runs: Sequence[ComparedRun]) -> Noise:
@@ -164,14 +163,6 @@ MIN_IN_BIN = 3  #: Least rows of a run in a bin for a mean.
 SEGMENT_ROWS = 64  #: Longest segment of a spectrum: some 10 s.
 MIN_SEGMENT_ROWS = 8  #: Shortest segment of a spectrum.
 COVARIANCE_ROWS = 8192  #: Grid of the spectrum from which the covariance of coloured noise is taken.
-
-
-class BinnedMeans(NamedTuple):
-    """Means of residuals over bins of an input: centres, means and half 95 % intervals (bins,)."""
-
-    centre: Array
-    mean: Array
-    half_interval: Array
 
 
 def spectrum(residuals: Sequence[Array], rate_hz: float) -> tuple[Array, Array]:
@@ -207,8 +198,8 @@ def input_range(inputs: Sequence[Array]) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def binned_means(inputs: Sequence[Array], residuals: Sequence[Array]) -> BinnedMeans:
-    """Return the means of residuals in bins of equal width, with intervals over runs.
+def binned_means(inputs: Sequence[Array], residuals: Sequence[Array]) -> tuple[Array, Array, Array]:
+    """Return bins of equal width (bins,): centres, means of residuals, and half 95 % intervals over runs.
 
     Examples
     --------
@@ -228,7 +219,8 @@ def binned_means(inputs: Sequence[Array], residuals: Sequence[Array]) -> BinnedM
         if n:
             half = student.ppf(0.975, n - 1) * np.std(each, ddof=1) / math.sqrt(n) if n > 2 else math.nan
             rows.append(((low + high) / 2, float(np.mean(each)), half))
-    return BinnedMeans(*np.array(rows).reshape(-1, 3).T)
+    centre, mean, half = np.array(rows).reshape(-1, 3).T
+    return centre, mean, half
 
 
 def run_means(residuals: Sequence[Array], sizes: Sequence[Array], weights: Array) -> tuple[Array, Array]:

@@ -39,7 +39,7 @@ from terrain.errors import ConfigError, DataError
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
 from terrain.logs.schema import POSE_CHANNELS
-from terrain.records import Array, RunLog, read_only
+from terrain.records import Array, RunLog
 from terrain.robots import BicycleRobot, Robot
 from terrain.simulation.plants.planar import (
     Ground,
@@ -173,10 +173,6 @@ class Signals:
     #: (n, len(CHANNELS)) what the simulation is compared with; NaN where nothing was measured
     measured: Array
     session: str = ""  #: that the run is part of; empty where that is not known
-
-    def __post_init__(self) -> None:
-        for name in ("wheel_speed_mps", "steer_rad", "grade_rad", "roll_rad", "measured"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
 
     def __len__(self) -> int:
         return len(self.measured)

@@ -145,14 +145,14 @@ def test_simulated_runs_are_plausible(robot, terrain, scenario):
     assert not odd
 
 
-SETS = (
+SETS = [
     "borealtc",
     "vulpi",
     "drive_husky",
     "drive_warthog_terrains/sand_1",
     "drive_marmotte",
     "drive_recordings",
-)
+]
 
 
 @pytest.mark.parametrize("name", SETS)
@@ -164,6 +164,9 @@ def test_no_measured_run_is_implausible(measured, name):
     assert not [doubt for doubt in doubts if doubt.check.level == Level.IMPLAUSIBLE]
     assert len(doubts) <= 0.02 * len(runs)
     # the same runs with a usual mistake are found out: the verdict is no constant
+    if name in ("borealtc", "vulpi"):
+        quality = [stream_quality(stream) for run in runs for stream in run.streams.values()]
+        assert all((each.stuck, each.n_gaps) == ((), 0) and each.jitter_s < 1e-6 for each in quality)
     judged = [run for run in runs if "imu" in run.streams]
     turned = [replace_imu(run, -1.0) for run in judged]
     found = [
@@ -185,15 +188,6 @@ def test_inspect_has_every_check_and_its_figure(tmp_path):
 
 
 # -- Shape of a stream: gaps, stuck channels, missing samples --------------------------------------------------
-
-
-@pytest.mark.parametrize("dataset", ["borealtc", "vulpi"])
-def test_the_published_runs_raise_no_false_alarm(datasets_dir, dataset):
-    for run in load_runs(datasets_dir / dataset):
-        for name, stream in run.streams.items():
-            quality = stream_quality(stream)
-            assert (quality.stuck, quality.n_gaps) == ((), 0), (run.run_id, name)
-            assert quality.jitter_s < 1e-6
 
 
 @pytest.fixture
