@@ -39,6 +39,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import minimize_scalar
+from scipy.special import log_softmax
 
 from terrain.classify.folds import TOO_FEW, inner_splits
 from terrain.classify.grouped import GroupedClassifier
@@ -141,12 +142,6 @@ def _seen(columns: SampleColumns, values: Array, floor: Array) -> Array:
         return values[:, :, None]
     power = power_spectrogram(values, columns.frame, columns.hop)
     return np.asarray(np.log(power + floor[:, None, None]))
-
-
-def log_softmax(logits: Array) -> Array:
-    """Return log probabilities along the last axis."""
-    shifted = logits - logits.max(axis=-1, keepdims=True)
-    return np.asarray(shifted - np.log(np.exp(shifted).sum(axis=-1, keepdims=True)))
 
 
 class Augmentation(NamedTuple):
@@ -574,7 +569,7 @@ def log_probabilities(content: bytes, columns: Sequence[SampleColumns], samples:
         )[0]
         for at in range(0, max(len(samples), 1), ROWS_AT_ONCE)
     ]
-    return log_softmax(np.concatenate(blocks).astype(np.float64))
+    return np.asarray(log_softmax(np.concatenate(blocks).astype(np.float64), axis=1))
 
 
 def check_network(content: bytes, columns: Sequence[SampleColumns], n_classes: int) -> None:
@@ -705,7 +700,7 @@ class GroupedNetwork(GroupedClassifier):
             log_probability[test] = held_out
         rows = np.flatnonzero(np.isfinite(log_probability).all(axis=1))
         temperature = fit_temperature(log_probability[rows], class_index[rows])
-        self.inner_probability_ = np.exp(log_softmax(log_probability / temperature))
+        self.inner_probability_ = np.exp(log_softmax(log_probability / temperature, axis=1))
         self.best_ = NetworkChoice(*used, epochs)
         self.onnx_ = network_onnx(training, nets, fill, temperature, self.classes_.tolist())
         return self
@@ -728,7 +723,9 @@ def fit_temperature(log_probability: Array, class_index: Array) -> float:
     rows = np.arange(len(class_index))
 
     def loss(log_temperature: float) -> float:
-        return float(-log_softmax(log_probability / np.exp(log_temperature))[rows, class_index].mean())
+        return float(
+            -log_softmax(log_probability / np.exp(log_temperature), axis=1)[rows, class_index].mean()
+        )
 
     found = minimize_scalar(loss, bounds=LOG_TEMPERATURE_BOUNDS, method="bounded")
     return float(np.exp(found.x))

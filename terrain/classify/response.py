@@ -40,6 +40,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize_scalar
+from scipy.special import softmax
 
 from terrain.classify.grouped import GroupedClassifier
 from terrain.errors import DataError
@@ -299,13 +300,13 @@ class GroupedResponse(GroupedClassifier):
         truth = np.searchsorted(self.classes_, y[rows])
 
         def loss(log_temperature: float) -> float:
-            stated = _softmax(np.exp(log_temperature) * likely[rows])[np.arange(len(rows)), truth]
+            stated = softmax(np.exp(log_temperature) * likely[rows], axis=1)[np.arange(len(rows)), truth]
             return -float(np.log(np.maximum(stated, 1e-12)).mean())
 
         found = minimize_scalar(loss, bounds=LOG_TEMPERATURE_BOUNDS, method="bounded")
         self.temperature_ = float(np.exp(found.x))
         self.best_ = ResponseChoice(self.temperature_)
-        self.inner_probability_ = _softmax(self.temperature_ * likely)
+        self.inner_probability_ = softmax(self.temperature_ * likely, axis=1)
         return self
 
     def predict_proba(self, X: Array) -> Array:
@@ -314,7 +315,7 @@ class GroupedResponse(GroupedClassifier):
         regime, moving = self._regimes(X)
         likely = np.zeros((len(X), len(self.classes_)))
         likely[moving] = self._log_likelihood(regime[moving], X[moving, self.columns[0] :])
-        return _softmax(self.temperature_ * likely)
+        return np.asarray(softmax(self.temperature_ * likely, axis=1))
 
     def _regimes(self, X: Array) -> tuple[Array, Array]:
         """Return the regimes of rows, and in which of them the robot moves."""
@@ -346,8 +347,3 @@ def log_density(apart: Array, covariance: Array) -> Array:
         power = 0.5 * (DEGREES_OF_FREEDOM + pattern.sum())
         out[rows] = -power * np.log1p(squared / DEGREES_OF_FREEDOM) - np.log(np.diag(lower)).sum()
     return out
-
-
-def _softmax(score: Array) -> Array:
-    weight = np.exp(score - score.max(axis=1, keepdims=True))
-    return np.asarray(weight / weight.sum(axis=1, keepdims=True))

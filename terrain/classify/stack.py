@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.special import log_softmax
 
 from terrain.classify.folds import fold_numbers
 from terrain.classify.grouped import GroupedClassifier
-from terrain.classify.network import GroupedNetwork, SampleColumns, log_softmax
+from terrain.classify.network import GroupedNetwork, SampleColumns
 from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.errors import DataError
 from terrain.records import Array
@@ -124,7 +125,7 @@ def fit_weights(probability: Array, class_index: Array) -> Array:
 def joined(probability: Array, weights: Array) -> Array:
     """Return probabilities (n, k) from those of both (2, n, k)."""
     logits = np.tensordot(weights, np.log(np.maximum(probability, TINY)), axes=1)
-    return np.asarray(np.exp(log_softmax(logits)))
+    return np.asarray(np.exp(log_softmax(logits, axis=1)))
 
 
 def log_of_truth(probability: Array, class_index: Array) -> Array:

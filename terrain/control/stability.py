@@ -132,7 +132,36 @@ def loop_matrices(
         loads
     """
     n_delayed, radius_m = _samples_of(delay_s, dt_s), robot.wheel_radius_m
-    short = np.array([plant_matrix(robot, *place) for place in places]) * (dt_s / 2**_HALVINGS)
+    (body, motors, _, _, sensors), third_kg = robot.equipment, robot.mass_kg / 3
+    rate, speed, contact, torque, q, estimate, measured, command = np.eye(8)  # w, v, k, T, q, e, y, u
+    lags_s = (
+        motors.torque_time_constant_s,
+        motors.speed_estimate_time_constant_s,
+        sensors.encoder_time_constant_s,
+    )
+    torque_s, estimate_s, encoder_s = (max(lag_s, STEP_S) for lag_s in lags_s)  # as in the simulator
+    systems = []  # (8, 8) of the plant; the last row, of the command, is 0
+    for speed_mps, slip_ratio, slope_ratio in places:
+        traction, braking = (
+            radius_m * (1 - slip_ratio) * rate - speed,
+            radius_m * rate - (1 + slip_ratio) * speed,
+        )
+        slip = (traction if slip_ratio > 0 else braking) / speed_mps
+        build_up = (slip - contact) * speed_mps / body.relaxation_length_m
+        thrust = slope_ratio * third_kg * GRAVITY_MPS2 * (contact + DEFLECTION_DAMPING_S * build_up)
+        speed_error = command - estimate
+        rows = (
+            (torque - radius_m * thrust) / body.wheel_inertia_kgm2,
+            thrust / third_kg,
+            build_up,
+            (motors.speed_gain_nmspr * speed_error + q - torque) / torque_s,
+            motors.speed_integral_nmpr * speed_error,
+            (rate - estimate) / estimate_s,
+            (slip - measured) / encoder_s,
+            np.zeros(8),
+        )
+        systems.append(rows)
+    short = np.array(systems) * (dt_s / 2**_HALVINGS)
     plants = one = np.eye(len(short[0]))
     for order in range(_TAYLOR_ORDER, 0, -1):
         plants = one + short @ plants / order
@@ -140,53 +169,19 @@ def loop_matrices(
         plants = plants @ plants
     *_, measured_slip, integral, filtered = np.eye(9)
     tau_s, loops = gains.derivative_time_constant_s, []
-    for (speed_mps, slip, _), plant in zip(places, plants, strict=True):
+    for (speed_mps, slip_ratio, _), plant in zip(places, plants, strict=True):
         error = -measured_slip * (speed_mps / radius_m)
         change = (error - filtered) * (-math.expm1(-dt_s / tau_s) if tau_s > 0 else 1.0)
         controller = np.array([integral + gains.ki * dt_s * error, filtered + change])
         output = gains.kp * error + controller[0] + gains.kd / dt_s * change
         loop = closed_loop(plant[:-1, :-1], plant[:-1, -1], controller, output, n_delayed)
-        rolls = radius_m * (1 - slip) if slip > 0 else radius_m / (1 + slip)
+        rolls = radius_m * (1 - slip_ratio) if slip_ratio > 0 else radius_m / (1 + slip_ratio)
         # The speeds of wheel and robot, the estimate and commands shift together.
         together = np.array([1.0, rolls, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, *np.ones(n_delayed)])
         # The loop on the complement of the direction that it maps to itself: its other eigenvalues.
         across = np.linalg.svd(together[None])[2][1:]
         loops.append(across @ loop @ across.T)
     return np.array(loops)
-
-
-def plant_matrix(robot: Robot, speed_mps: float, slip_ratio: float, slope_ratio: float) -> Array:
-    """Return the system matrix (8, 8) of ``w, v, k, T, q, e, y`` and the command u; the last row is 0."""
-    body, motors, _, _, sensors = robot.equipment
-    radius_m, third_kg = robot.wheel_radius_m, robot.mass_kg / 3
-    rate, speed, contact, torque, integral, estimate, measured_slip, command = np.eye(8)
-    slip = (
-        radius_m * (1 - slip_ratio) * rate - speed
-        if slip_ratio > 0
-        else radius_m * rate - (1 + slip_ratio) * speed
-    ) / speed_mps
-    build_up = (slip - contact) * speed_mps / body.relaxation_length_m
-    thrust = slope_ratio * third_kg * GRAVITY_MPS2 * (contact + DEFLECTION_DAMPING_S * build_up)
-    speed_error = command - estimate
-    desired = motors.speed_gain_nmspr * speed_error + integral
-    lags_s = (
-        motors.torque_time_constant_s,
-        motors.speed_estimate_time_constant_s,
-        sensors.encoder_time_constant_s,
-    )
-    torque_s, estimate_s, encoder_s = (max(lag_s, STEP_S) for lag_s in lags_s)  # as in the simulator
-    return np.array(
-        [
-            (torque - radius_m * thrust) / body.wheel_inertia_kgm2,
-            thrust / third_kg,
-            build_up,
-            (desired - torque) / torque_s,
-            motors.speed_integral_nmpr * speed_error,
-            (rate - estimate) / estimate_s,
-            (slip - measured_slip) / encoder_s,
-            np.zeros(8),
-        ]
-    )
 
 
 def closed_loop(keep: Array, drive: Array, controller: Array, output: Array, n_delayed: int) -> Array:

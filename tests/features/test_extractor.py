@@ -2,17 +2,13 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
 
 from features.extractor import FeatureExtractor, SampleExtractor, derived_channels, is_centred, speed_features
-from features.stream import WindowStream
-from features.windows import WindowRule, cut_windows, layout_of
 from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import SIGNAL_SETS
-from terrain.records import RunLog, Stream, Windows
+from terrain.records import Windows
 
 CHANNELS = {
     "imu": tuple(
@@ -89,28 +85,6 @@ def test_one_by_one_is_all_at_once_and_the_order_of_channels_is_no_matter():
         channels={name: channels[::-1] for name, channels in windows.channels.items()},
     )
     np.testing.assert_array_equal(extractor.transform(turned), together)
-
-
-def test_live_windows_give_the_features_of_the_log():
-    rng = np.random.default_rng(0)
-    streams = {}
-    for name in ("imu", "wheels"):
-        time_s = np.arange(0, 21, 1 / RATE_HZ[name])
-        streams[name] = Stream(
-            time_s, rng.normal(0.5, 0.1, (time_s.size, len(CHANNELS[name]))), CHANNELS[name]
-        )
-    run = RunLog("a", "husky", streams)
-    windows = cut_windows([run]).windows
-    extractor = FeatureExtractor().fit(windows)
-    live = WindowStream(WindowRule(), layout_of([run]))
-    events = sorted((t, name, i) for name, s in streams.items() for i, t in enumerate(s.time_s))
-    rows = [
-        extractor.transform(window)
-        for t, name, i in events
-        for window in live.push(name, t, streams[name].values[i])
-    ]
-    assert len(rows) == len(windows) == 10
-    np.testing.assert_allclose(np.concatenate(rows), extractor.transform(windows), rtol=1e-9, atol=1e-12)
 
 
 def test_slip_that_is_unknown_makes_slip_features_unknown_and_no_other():
@@ -201,8 +175,7 @@ def test_per_speed_features_match_their_definitions():
             np.testing.assert_allclose(backwards[name], slow[name])
 
 
-@settings(deadline=None, max_examples=30)
-@given(st.integers(0, 2**32 - 1))
+@pytest.mark.parametrize("seed", range(3))
 def test_norms_do_not_see_how_the_sensor_is_mounted(seed):
     rng = np.random.default_rng(seed)
     imu = rng.standard_normal((3, 6, 40))

@@ -74,7 +74,7 @@ def logs(draw):
     return RunLog("a", "husky", streams), rule, layout
 
 
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=80)
 @given(logs())
 def test_sample_by_sample_gives_the_very_windows_and_drops_of_the_whole_log(case):
     run, rule, layout = case

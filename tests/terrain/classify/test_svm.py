@@ -95,7 +95,7 @@ def test_the_choice_is_the_best_held_out_candidate_and_costs_few_fits():
 
 def test_labels_that_only_identify_runs_give_scores_of_chance():
     scores, split = [], []
-    for seed in range(6):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         runs = np.repeat(np.arange(24), 8)
         y = np.array(["ice", "snow"])[rng.permutation(np.arange(24) % 2)][runs]
@@ -103,8 +103,8 @@ def test_labels_that_only_identify_runs_give_scores_of_chance():
         candidates = CANDIDATES[3:4]  # the best of many would be above chance by luck
         scores.append(GroupedSVC(candidates, seed=seed).fit(X, y, groups=runs).inner_scores_[0])
         split.append(GroupedSVC(candidates, seed=seed).fit(X, y).inner_scores_[0])
-    # 24 runs are 24 coin tosses: a standard deviation of 0.10 for one, of 0.04 for the mean of six.
-    assert abs(np.mean(scores) - 0.5) < 0.13
+    # 24 runs are 24 coin tosses: a standard deviation of 0.10 for one, of 0.05 for the mean of four.
+    assert abs(np.mean(scores) - 0.5) < 0.16
     assert np.mean(split) > 0.95  # the test can fail: folds that split runs look perfect
 
 

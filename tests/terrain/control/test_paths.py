@@ -9,12 +9,11 @@ from terrain.control.car_following import (
     SteeringSettings,
     SteerState,
     SteerStatus,
-    check_steering,
     law_17,
     steer,
 )
 from terrain.control.paths import PathStatus, Place, path_from_curvature, path_from_points, read_path
-from terrain.errors import ConfigError, DataError, TerrainError
+from terrain.errors import DataError, TerrainError
 from terrain.robots import load_robot
 
 ARC = path_from_curvature(np.array([0.0, 10.0, 14.0, 30.0]), np.array([0.0, 0.0, 0.1, 0.1]))
@@ -215,9 +214,3 @@ def test_bad_inputs_have_a_status_and_a_finite_angle():
         command, after, status = steered((5.0, lateral, angle, curvature))
         assert np.isfinite([command, *after]).all()
         assert status in (SteerStatus.SINGULAR, SteerStatus.CLAMPED)
-
-
-@pytest.mark.parametrize("bad", [{"position_pm2": 0.0}, {"delay_s": -1.0}, {"offset_m": np.nan}])
-def test_settings_that_cannot_be_are_refused(bad):
-    with pytest.raises(ConfigError):
-        check_steering(SteeringSettings(**bad))

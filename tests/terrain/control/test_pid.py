@@ -1,6 +1,7 @@
 """The PID step against its linear form, and the thesis' controller against table 8.1, in any drive and on grass."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -8,6 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
+from terrain.control.car_following import SteeringSettings, check_steering
+from terrain.control.path_tracking import SETTINGS as TRACKING
+from terrain.control.path_tracking import check_tracking
 from terrain.control.pid import (
     LONGEST_STEP_S,
     Gains,
@@ -20,7 +24,11 @@ from terrain.control.pid import (
     wheel_step,
 )
 from terrain.control.slip_table import DRIVE_STATES
+from terrain.control.switching import SWITCHING, check_switching
+from terrain.control.traction import SETTINGS as TRACTION
+from terrain.control.traction import check_settings
 from terrain.errors import ConfigError
+from terrain.robots import load_robot
 
 DT_S, NAN = 0.02, math.nan
 
@@ -75,24 +83,38 @@ def test_a_fault_gives_nothing_freezes_the_integral_and_leaves_no_kick(error, dt
     assert resumed == pytest.approx(50.0 + before.integral + 50.0 * DT_S)  # no derivative over the gap
 
 
+CHECKS = {
+    "gain ": (check_gains, Gains(1.0, 0.0, 0.0, 1.0)),
+    "traction: ": (check_settings, TRACTION),
+    "switching: ": (check_switching, SWITCHING),
+    "path tracking: ": (partial(check_tracking, load_robot("agrimaro")), TRACKING),
+    "steering: ": (check_steering, SteeringSettings()),
+}
+ZERO_UP, ABOVE = "from zero up", "above zero"
+
+
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("what", "name", "value", "accepted"),
     [
-        ({"kp": -0.1}, "gain kp is -0.1, a number from zero up is required"),
-        ({"ki": NAN}, "gain ki is nan"),
-        ({"kd": math.inf}, "gain kd is inf"),
-        ({"kp": "1"}, "gain kp is '1'"),
-        ({"kp": True}, "gain kp is True"),
-        ({"limit": 0}, "gain limit is 0, a number above zero is required"),
-        ({"limit": math.inf}, "gain limit is inf"),
-        ({"integral_limit": 0.0}, "gain integral_limit is 0.0, a number above zero is required"),
+        *[("gain ", "kp", value, ZERO_UP) for value in (-0.1, NAN, "1", True)],
+        *[("gain ", "limit", value, ABOVE) for value in (0, math.inf)],
+        ("gain ", "integral_limit", 0.0, ABOVE),
+        *[("traction: ", "fade_mps2", value, ZERO_UP) for value in ("fast", None, math.inf)],
+        ("traction: ", "launch_mps", 0.0, ABOVE),
+        *[("switching: ", "probability_least", value, "from 0 to 1") for value in (1.01, NAN)],
+        *[("path tracking: ", name, -0.1, ZERO_UP) for name in ("lag_s", "cross_pm")],
+        ("path tracking: ", "arm_m", 0.0, ABOVE),
+        ("steering: ", "position_pm2", 0.0, ABOVE),
+        ("steering: ", "delay_s", -1.0, "from 0 to 2"),
+        ("steering: ", "offset_m", NAN, ZERO_UP),
     ],
 )
-def test_invalid_gains_are_refused_in_one_sentence(change, message):
+def test_settings_that_cannot_be_are_refused_in_one_sentence(what, name, value, accepted):
+    check, settings = CHECKS[what]
+    check(settings)
     with pytest.raises(ConfigError) as refused:
-        check_gains(Gains(1.0, 0.0, 0.0, 1.0)._replace(**change))
-    assert str(refused.value).startswith(message)
-    assert "\n" not in str(refused.value)
+        check(settings._replace(**{name: value}))
+    assert str(refused.value) == f"{what}{name} is {value!r}, a number {accepted} is required"
 
 
 PROPORTIONAL = Gains(1.0, 0.0, 0.0, limit=10.0)
@@ -168,40 +190,21 @@ def test_any_drive_with_faults_is_mirror_symmetric_and_reaches_every_status():
         if k % 31 == 0:
             chassis, dt_s = rng.choice([[NAN, 0.02], [1.0, rng.choice([NAN, 0.0, -0.1, 0.6])]])
         given = (wheels[0], wheels[1], speed, accel)
+        kept = states
         found, states = wheels_step(gains, states, given, chassis, TARGETS, dt_s)
         other, mirrored = wheels_step(gains, mirrored, [-a for a in given], chassis, TARGETS, dt_s)
-        for one, reflected, state, image in zip(found, other, states, mirrored, strict=True):
+        for one, reflected, before, state, image in zip(found, other, kept, states, mirrored, strict=True):
             assert one[2:] == reflected[2:]
             assert np.array_equal(one[:2], -np.array(reflected[:2]), equal_nan=True)
             assert state.direction == -image.direction
             assert state.pid.integral == -image.pid.integral
+            if one.status in (ThesisStatus.NO_ERROR, ThesisStatus.BAD_TIME, ThesisStatus.STANDING):
+                assert state.pid.integral in (0.0, before.pid.integral)
             assert one.correction_radps == 0.0 or one.status in (
                 *(ThesisStatus.OK, ThesisStatus.CLAMPED, ThesisStatus.LOW_SPEED),
             )
         seen |= {one.status for one in found}
     assert seen == set(ThesisStatus)
-
-
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        ({"rate": NAN}, ThesisStatus.NO_ERROR),
-        ({"speed": NAN, "chassis": 1.0}, ThesisStatus.NO_ERROR),
-        ({"accel": NAN}, ThesisStatus.NO_ERROR),
-        ({"chassis": NAN}, ThesisStatus.NO_ERROR),
-        ({"targets": (NAN, NAN, NAN)}, ThesisStatus.NO_ERROR),
-        ({"dt_s": 0.51}, ThesisStatus.BAD_TIME),
-        ({"chassis": 0.05}, ThesisStatus.STANDING),
-    ],
-)
-def test_without_valid_inputs_nothing_is_added_and_the_integral_is_kept(changes, expected):
-    gains = Gains(0.5, 5.0, 0.1, 5.0)
-    drive = {"rate": 5.0, "speed": 0.7, "accel": 0.0, "command": 5.0}
-    _, state = step(gains, WheelPid(), **drive)
-    assert state.pid.integral != 0.0
-    found, after = step(gains, state, **drive | changes)
-    assert (found.correction_radps, found.status) == (0.0, expected)
-    assert (after.pid.integral, after.direction) == (state.pid.integral, state.direction)
 
 
 def test_a_wheel_that_rolls_against_its_command_is_not_corrected_and_its_integral_is_reset():

@@ -16,12 +16,10 @@ from terrain.control.switching import (
     TerrainBelief,
     TerrainSource,
     approach,
-    check_switching,
     drive_on,
     output_status,
     update,
 )
-from terrain.errors import ConfigError
 from terrain.records import Sample
 
 NAN, INF = math.nan, math.inf
@@ -110,21 +108,6 @@ def test_a_target_moves_at_its_rate_and_never_past_its_end(now, desired, rate, d
     if there != pytest.approx(desired, abs=1e-12):
         assert abs(there - now) == pytest.approx(rate * max(dt_s, 0.0), abs=1e-12)
     assert approach(NAN, desired, rate, dt_s) == desired
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "wording"),
-    [
-        ("probability_least", 1.01, "from 0 to 1"),
-        ("probability_least", NAN, "from 0 to 1"),
-        ("silent_s", INF, "from zero up"),
-        ("rate_ratio", True, "from zero up"),
-    ],
-)
-def test_invalid_settings_are_refused_in_one_sentence(name, value, wording):
-    with pytest.raises(ConfigError) as refused:
-        check_switching(SWITCHING._replace(**{name: value}))
-    assert str(refused.value) == f"switching: {name} is {value!r}, a number {wording} is required"
 
 
 def test_a_known_terrain_is_given_once_a_change_and_no_terrain_never():

@@ -15,7 +15,6 @@ from terrain.control.traction import (
     check_settings,
     traction_step,
 )
-from terrain.errors import ConfigError
 from terrain.kinematics.commands import inverse
 from terrain.kinematics.wheels import no_slip_twist
 from terrain.robots import load_robot
@@ -228,22 +227,3 @@ def test_speed_never_falls_while_more_is_desired_and_the_turning_centre_stays(
         assert np.array_equal(back, -command)
         assert np.array_equal(report_back, report, equal_nan=True)
         assert np.array_equal(numbers_of(after_back)[:-3], numbers_of(after)[:-3], equal_nan=True)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "accepted"),
-    [
-        ("lead_s", -0.1, "from zero up"),
-        ("launch_mps", 0.0, "above zero"),
-        ("droop_time_s", 0, "above zero"),
-        ("charge_time_s", NAN, "above zero"),
-        ("std_max_ratio", INF, "from zero up"),
-        ("fade_mps2", "fast", "from zero up"),
-        ("fade_mps2", True, "from zero up"),
-        ("stale_max_s", None, "from zero up"),
-    ],
-)
-def test_invalid_settings_are_refused_in_one_sentence(name, value, accepted):
-    with pytest.raises(ConfigError) as refused:
-        check_settings(SETTINGS._replace(**{name: value}))
-    assert str(refused.value) == f"traction: {name} is {value!r}, a number {accepted} is required"
