@@ -12,7 +12,7 @@ import numpy as np
 from features.windows import Layout, WindowRule, cut_windows, regular_starts, span_of
 from terrain.classify.folds import Fold
 from terrain.classify.metrics import STRIDE_S, Track, last_class, track_of
-from terrain.classify.terrain_filter import TerrainFilter, check_filter, filter_run, reported
+from terrain.classify.terrain_filter import check_prior, filter_run, reported
 from terrain.logs.splicing import SplicedRun, parts_under, sequences_of
 from terrain.records import RunLog, Windows
 
@@ -30,7 +30,7 @@ def follow(
     ``prior`` has the part of each class among the training windows, in order.
     """
     classes, tracks, rule = np.array([*prior]), [], replace(rule, stride_s=STRIDE_S)
-    settings = check_filter(TerrainFilter(tuple(prior.values())))
+    shares = check_prior([*prior.values()])
     for log, runs, spliced in sequences:
         begin_s, end_s = span_of(log, layout)
         starts_s = regular_starts(begin_s, end_s, rule.length_s, STRIDE_S)
@@ -41,8 +41,8 @@ def follow(
             probability[rows] = 0.0
             found = classifier.predict_proba(np.asarray(features.fit_transform(windows)))
             probability[np.ix_(rows, np.searchsorted(classes, classifier.classes_))] = found
-        belief = filter_run(probability, starts_s + rule.length_s, settings)
-        reports = reported(belief, settings.threshold), last_class(probability)
+        belief = filter_run(probability, starts_s + rule.length_s, shares)
+        reports = reported(belief), last_class(probability)
         tracks.append(track_of(log.labels, runs, starts_s, rule.length_s, *reports, classes, spliced))
     return tracks
 

@@ -149,12 +149,12 @@ def _propose(settings: Settings, model_uri: str) -> ProposalsResult:
     from pipelines.data.datasets import load_runs
     from pipelines.learn.model_file import read_model
     from pipelines.live.model import assess
-    from pipelines.live.windows import filter_of, windows_of_log
+    from pipelines.live.windows import prior_of, windows_of_log
     from terrain.classify.proposals import propose, questions
     from terrain.files.atomic import atomic_write
 
     model, runs = read_model(model_uri), load_runs(settings.data)
-    of_model = model.info.classes, filter_of(model.info).prior
+    of_model = model.info.classes, prior_of(model.info)
     proposals: list[Proposal] = []
     for run in runs:
         windows = windows_of_log(run, model.info, skip_short=True).windows

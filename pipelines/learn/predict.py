@@ -243,17 +243,17 @@ def _predict_windows(windows: Windows, model: TerrainModel, table: SlipTable) ->
     import numpy as np
 
     from pipelines.live.model import assess, class_sets
-    from pipelines.live.windows import filter_of
+    from pipelines.live.windows import prior_of
     from terrain.classify.terrain_filter import filter_run, novelty_evidence, reported
     from terrain.control.switching import UNKNOWN
 
     if not len(windows):
         return []
-    assessed, settings = assess(model, windows), filter_of(model.info)
+    assessed, prior = assess(model, windows), prior_of(model.info)
     best, sets = assessed.probability.argmax(axis=1), class_sets(model, assessed.probability)
     evidence = novelty_evidence(assessed.novelty, assessed.unknown)
     end_s = windows.start_s + windows.length_s
-    over_time = reported(filter_run(assessed.probability, end_s, settings, evidence), settings.threshold)
+    over_time = reported(filter_run(assessed.probability, end_s, prior, evidence))
     rows = []
     for i in range(len(windows)):
         nearest = model.info.classes[best[i]]

@@ -18,7 +18,6 @@ from features.motion import window_motion
 from features.windows import Layout, SteadyMotion, WindowRule
 from pipelines.report.results import described
 from terrain.classify.limits import SUPPORTED, Novelty, SupportTable, conformal_sets, supported_probability
-from terrain.classify.terrain_filter import TerrainFilter
 from terrain.records import Array, Windows
 
 
@@ -75,7 +74,7 @@ class TerrainModel(NamedTuple):
     info: ModelInfo
     novelty: Novelty | None = None
     support: SupportTable | None = None
-    over_time: TerrainFilter | None = None
+    over_time: Array | None = None
 
 
 class Assessed(NamedTuple):

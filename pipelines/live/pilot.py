@@ -28,7 +28,7 @@ from terrain.control.robot_control import (
     check_pilot,
 )
 from terrain.control.slip_table import SlipTable, load_slip_table
-from terrain.control.switching import OutputStatus, TerrainSource
+from terrain.control.switching import SWITCHING, OutputStatus, TerrainSource
 from terrain.control.traction import TractionStatus
 from terrain.estimation.clocks import Clocks, finite_twist
 from terrain.estimation.feed import places_among
@@ -82,7 +82,7 @@ class LivePilot(Chain):
     ) -> None:
         table = load_slip_table() if table is None else table
         driven, correction = correct_live(check_pilot(robot, table, settings))
-        super().__init__(robot.name, table, settings.switching, Clocks())
+        super().__init__(robot.name, table, SWITCHING, Clocks())
         self.source = TerrainSource() if source is None else source
         if settings.controller not in OPEN_LOOP:
             self._filter = LiveFilter(driven, PILOT_FILTER, correction=correction)

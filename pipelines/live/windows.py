@@ -19,13 +19,13 @@ from features.windows import (
     label_windows,
 )
 from pipelines.live.model import ModelInfo, TerrainModel
-from terrain.classify.terrain_filter import TerrainFilter, check_filter
+from terrain.classify.terrain_filter import check_prior
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live import LIVE_FILTERS, Estimator, estimated_channels, make_live_filter
 from terrain.extension import correct_live
 from terrain.logs.replay import SENSORS, replay
 from terrain.logs.schema import ESTIMATED
-from terrain.records import RunLog
+from terrain.records import Array, RunLog
 from terrain.robots import Robot, robot_named
 
 STRIDE_S = 0.25  #: From window to window of a model whose outputs are filtered over time, in place of a dwell
@@ -154,10 +154,9 @@ def windows_of_log(
     return WindowCut(labelled, Counter(reasons))
 
 
-def filter_of(info: ModelInfo) -> TerrainFilter:
-    """Return the filter of a model: shares of its classes in training, equal ones where it has none."""
-    prior = tuple(float(info.class_ratio.get(name, 1.0 / len(info.classes))) for name in info.classes)
-    return check_filter(TerrainFilter(prior))
+def prior_of(info: ModelInfo) -> Array:
+    """Return the shares (k,) of a model's classes in training, equal ones where it has none."""
+    return check_prior([float(info.class_ratio.get(name, 1.0 / len(info.classes))) for name in info.classes])
 
 
 def filtered(model: TerrainModel, stride_s: float | None = STRIDE_S) -> TerrainModel:
@@ -176,4 +175,4 @@ def filtered(model: TerrainModel, stride_s: float | None = STRIDE_S) -> TerrainM
             "is required"
         )
     info = replace(model.info, stride_s=stride_s)
-    return model._replace(info=info, over_time=filter_of(model.info))
+    return model._replace(info=info, over_time=prior_of(model.info))

@@ -167,9 +167,8 @@ def fisher_scores(reference: Array, terms: Array) -> Array:
 def learn_novelty(
     X: Array,
     y: Array,
-    groups: Array | None = None,
+    groups: Array,
     *,
-    n_inner_folds: int = N_INNER_FOLDS,
     gap: int = 1,
     seed: int = 0,
 ) -> Novelty:
@@ -177,7 +176,6 @@ def learn_novelty(
 
     Parameters
     ----------
-    n_inner_folds : of whole runs, whose windows are the references; each row is a run of its own without ``groups``
     gap : rows left out beside a block, where the only run of a class is cut
     seed : deals runs into inner folds
 
@@ -186,11 +184,10 @@ def learn_novelty(
     DataError
         if there is one class only, or rows are too few to hold some of them out.
     """
-    X, y = np.asarray(X, dtype=float), np.asarray(y)
-    groups = np.arange(len(y)) if groups is None else np.asarray(groups)
+    X, y, groups = np.asarray(X, dtype=float), np.asarray(y), np.asarray(groups)
     two_classes(y)
     terms = np.full((len(y), N_TERMS), np.nan)
-    for train, test in inner_splits(y, groups, n_inner_folds, seed, gap):
+    for train, test in inner_splits(y, groups, N_INNER_FOLDS, seed, gap):
         terms[test] = _fitted(X[train], y[train]).terms(X[test])
     known = terms[np.isfinite(terms).all(axis=1)]
     if not len(known):

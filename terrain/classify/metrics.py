@@ -492,27 +492,28 @@ def compare_outcomes(a: Outcome, b: Outcome, rng: np.random.Generator) -> Compar
     number, terrain = {cell: i for i, cell in enumerate(cells)}, np.array([name for _, name in cells])
     weights = np.vstack([np.ones(len(cells)), stratified_counts(terrain, N_PAIRED_DRAWS, rng)])
     parts = {"": np.ones(len(cells))} | {str(name): (terrain == name) * 1.0 for name in np.unique(terrain)}
-    figures, rates = list[dict[str, Array]](), []
+    figures, rates = [], []
     for each, of_windows in zip((a, b), pairs, strict=True):
         place = np.array([number[pair] for pair in of_windows])
         size = np.bincount(place)
         rate = np.bincount(place, weights=each.correct.mean(axis=0)) / size
-        found = {
+        by_part = {
             name: weights @ (kept * rate * size) / (weights @ (kept * size)) for name, kept in parts.items()
         }
         of_class = [(weights[:, kept > 0], rate[kept > 0]) for name, kept in parts.items() if name]
-        found["\nmacro"] = np.mean([drawn @ one / drawn.sum(axis=1) for drawn, one in of_class], axis=0)
+        macro = np.mean([drawn @ one / drawn.sum(axis=1) for drawn, one in of_class], axis=0)
         repeats = zip(each.confidence, each.correct.astype(float), strict=True)
         areas = [confidence_auc(c, right, weights[:, place]) for c, right in repeats]
-        figures.append(found | {"\narea": np.mean(areas, axis=0)})
+        figures.append((by_part, macro, np.mean(areas, axis=0)))
         rates.append(rate.tolist())
-    differences = {
-        name: _difference(one, figures[1][name], int(parts[name if name in parts else ""].sum()))
-        for name, one in figures[0].items()
+    (parts_a, macro_a, area_a), (parts_b, macro_b, area_b) = figures
+    accuracy = {
+        name: _difference(parts_a[name], parts_b[name], int(kept.sum())) for name, kept in parts.items()
     }
+    of_all = accuracy.pop("")
+    macro_run, area = (_difference(*each, len(cells)) for each in ((macro_a, macro_b), (area_a, area_b)))
     by_run = (RunDifference(*cell, *pair) for cell, *pair in zip(cells, *rates, strict=True))
-    accuracy, macro, area = (differences.pop(name) for name in ("", "\nmacro", "\narea"))
-    return Comparison(accuracy, macro, area, differences, tuple(by_run))
+    return Comparison(of_all, macro_run, area, accuracy, tuple(by_run))
 
 
 def paired_accuracy(

@@ -86,7 +86,7 @@ def propose(
     supported: Array,
     unknown: Array,
     classes: Sequence[str],
-    prior: Sequence[float],
+    prior: Array,
 ) -> list[Proposal]:
     """Return the proposals for a run, in order of time.
 
@@ -97,7 +97,7 @@ def propose(
     supported, unknown : (n,) whether training runs support it, NaN where not counted; whether it is unlike all
     classes, prior : (k,) names, and their shares among the training windows
     """
-    path = smoothed_classes(probability, start_s, np.array(prior))
+    path = smoothed_classes(probability, start_s, prior)
     changed = (np.diff(path) != 0) | (np.diff(start_s) > (1.0 + MAX_GAP_WINDOWS) * length_s)
     return [
         Proposal(

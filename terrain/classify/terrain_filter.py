@@ -26,6 +26,7 @@ Hidden Markov model with k classes and the state "unknown", in continuous time. 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -54,25 +55,6 @@ DETECTED_RATIO = 0.2
 KNOWN_FLAGGED_RATIO = 0.05
 
 
-class TerrainFilter(NamedTuple):
-    """Settings of the filter."""
-
-    #: share of each of the k classes among the training windows, in the order of the probabilities
-    prior: tuple[float, ...]
-    evidence_s: float = EVIDENCE_S  #: T, time between windows that bring evidence of their own
-    dwell_s: float = DWELL_S  #: D, mean time on one ground
-    threshold: float = THRESHOLD  #: probability from which a class is reported
-    #: outlier_ratio, unknown_ratio: share of windows that follow no class, and of grounds that are unknown
-    outlier_ratio: float = OUTLIER_RATIO
-    unknown_ratio: float = UNKNOWN_RATIO
-
-    @property
-    def grounds(self) -> Array:
-        """Share of each state (k + 1,) among the grounds that are come to; "unknown" is the last."""
-        n_classes = len(self.prior)
-        return np.append(np.full(n_classes, (1.0 - self.unknown_ratio) / n_classes), self.unknown_ratio)
-
-
 class FilterBelief(NamedTuple):
     """Probability of each state (k + 1,), "unknown" last, and the time since the last output in s."""
 
@@ -80,59 +62,52 @@ class FilterBelief(NamedTuple):
     silent_s: float = math.inf
 
 
-def check_filter(settings: TerrainFilter) -> TerrainFilter:
-    """Return settings that are accepted.
+def check_prior(prior: Sequence[float]) -> Array:
+    """Return the shares (k,) of the classes; ``ConfigError`` where they are fewer than two, or not within 0 and 1."""
+    if len(prior) < 2:
+        raise ConfigError(f"terrain filter: {len(prior)} classes, at least 2 are required")
+    for number, share in enumerate(prior, start=1):
+        if not 0.0 < share < 1.0:
+            raise ConfigError(
+                f"terrain filter: prior of class {number} is {share!r}, a number between 0 and 1 is required"
+            )
+    return np.array(prior, dtype=float)
 
-    Raises
-    ------
-    ConfigError
-        if there are fewer than two classes, a share is not within 0 and 1, or a time is not above zero.
-    """
-    if len(settings.prior) < 2:
-        raise ConfigError(f"terrain filter: {len(settings.prior)} classes, at least 2 are required")
-    shares = {f"prior of class {i + 1}": value for i, value in enumerate(settings.prior)}
-    shares |= {name: getattr(settings, name) for name in ("outlier_ratio", "unknown_ratio")}
-    for name, value in shares.items():
-        if not 0.0 < value < 1.0:
-            raise ConfigError(f"terrain filter: {name} is {value!r}, a number between 0 and 1 is required")
-    if not 0.0 <= settings.threshold <= 1.0:
-        raise ConfigError(f"terrain filter: threshold is {settings.threshold!r}, 0 to 1 is required")
-    for name in ("evidence_s", "dwell_s"):
-        value = getattr(settings, name)
-        if not (math.isfinite(value) and value > 0.0):
-            raise ConfigError(f"terrain filter: {name} is {value!r}, a finite number above zero is required")
-    return settings
+
+def grounds_of(n_classes: int) -> Array:
+    """Return the share of each state (k + 1,) among the grounds that are come to; "unknown" is the last."""
+    return np.append(np.full(n_classes, (1.0 - UNKNOWN_RATIO) / n_classes), UNKNOWN_RATIO)
 
 
 def filter_step(
-    belief: FilterBelief, probability: Array, dt_s: float, settings: TerrainFilter, novelty: float = 0.0
+    belief: FilterBelief, probability: Array, dt_s: float, prior: Array, novelty: float = 0.0
 ) -> FilterBelief:
     """Return the belief after a time, and one output of the classifier: probabilities (k,), NaN where there is none.
 
-    ``novelty`` is the log-likelihood of "unknown" against that of all known grounds together.
+    ``prior`` (k,) has the share of each class among the training windows, ``novelty`` is the log-likelihood of
+    "unknown" against that of all known grounds together.
     """
-    grounds = settings.grounds
-    stays = math.exp(-dt_s / (settings.dwell_s * (1.0 - grounds[0])))
+    grounds = grounds_of(len(prior))
+    stays = math.exp(-dt_s / (DWELL_S * (1.0 - grounds[0])))
     now = stays * belief.probability + (1.0 - stays) * grounds
     silent_s = belief.silent_s + dt_s
     if not np.isfinite(probability).all():
         return FilterBelief(now, silent_s)
-    share, power = settings.outlier_ratio, min(silent_s / settings.evidence_s, 1.0)
-    now[:-1] *= ((1.0 - share) * np.asarray(probability) / np.array(settings.prior) + share) ** power
+    power = min(silent_s / EVIDENCE_S, 1.0)
+    now[:-1] *= ((1.0 - OUTLIER_RATIO) * np.asarray(probability) / prior + OUTLIER_RATIO) ** power
     if math.isfinite(novelty):
         now[-1] *= math.exp(power * novelty)
     return FilterBelief(now / now.sum(), 0.0)
 
 
-def filter_run(
-    probability: Array, time_s: Array, settings: TerrainFilter, novelty: Array | None = None
-) -> Array:
+def filter_run(probability: Array, time_s: Array, prior: Array, novelty: Array | None = None) -> Array:
     """Return the belief (n, k + 1) after each of the windows of a run; it knows nothing of later ones.
 
     Parameters
     ----------
     probability : (n, k) class probabilities; rows of NaN where the classifier refused a window
     time_s : (n,) end of each window, not decreasing
+    prior : (k,) share of each class among the training windows
     novelty : (n,) log-likelihood of "unknown" against that of all known grounds together; 0 by default
 
     Raises
@@ -143,13 +118,13 @@ def filter_run(
     Examples
     --------
     >>> probability = np.repeat([[0.9, 0.1], [0.1, 0.9]], 24, axis=0)
-    >>> belief = filter_run(probability, np.arange(48) / 4, TerrainFilter((0.5, 0.5)))
-    >>> float((reported(belief[24:], 0.5) == 1).argmax() / 4)  # s from the change to where it is reported
+    >>> belief = filter_run(probability, np.arange(48) / 4, np.array([0.5, 0.5]))
+    >>> float((reported(belief[24:]) == 1).argmax() / 4)  # s from the change to where it is reported
     0.75
     """
     rows, time_s = np.asarray(probability, dtype=np.float64), np.asarray(time_s, dtype=np.float64)
-    if rows.shape != (len(time_s), len(settings.prior)):
-        needed = f"({len(time_s)}, {len(settings.prior)})"
+    if rows.shape != (len(time_s), len(prior)):
+        needed = f"({len(time_s)}, {len(prior)})"
         raise DataError(f"class probabilities have the shape {rows.shape}, {needed} is needed")
     scores = np.zeros(len(rows)) if novelty is None else np.asarray(novelty, dtype=np.float64)
     if scores.shape != time_s.shape:
@@ -157,17 +132,17 @@ def filter_run(
     dt_s = np.diff(time_s, prepend=time_s[:1])
     if not (dt_s >= 0.0).all():
         raise DataError("the windows of a run must be in order of time")
-    belief, out = FilterBelief(settings.grounds), np.empty((len(rows), len(settings.prior) + 1))
+    belief, out = FilterBelief(grounds_of(len(prior))), np.empty((len(rows), len(prior) + 1))
     for i, (row, step_s, score) in enumerate(zip(rows, dt_s.tolist(), scores.tolist(), strict=True)):
-        belief = filter_step(belief, row, step_s, settings, score)
+        belief = filter_step(belief, row, step_s, prior, score)
         out[i] = belief.probability
     return out
 
 
-def reported(belief: Array, threshold: float) -> Array:
+def reported(belief: Array) -> Array:
     """Return the class (n,) that is certain enough in each belief (n, k + 1); -1 for "unknown"."""
     best = belief[:, :-1].argmax(axis=1)
-    certain = belief[np.arange(len(belief)), best] >= threshold
+    certain = belief[np.arange(len(belief)), best] >= THRESHOLD
     return np.asarray(np.where(certain, best, -1))
 
 
@@ -183,16 +158,15 @@ class LiveTerrainFilter:
 
     Examples
     --------
-    >>> live = LiveTerrainFilter(TerrainFilter((0.5, 0.5)))
+    >>> live = LiveTerrainFilter(np.array([0.5, 0.5]))
     >>> for end_s in (2.0, 2.25, 2.5, 2.75):
     ...     best, probability = live.take(end_s, np.array([0.9, 0.1]))
     >>> best, round(probability, 2)
     (0, 0.97)
     """
 
-    def __init__(self, settings: TerrainFilter) -> None:
-        self.settings = settings
-        self._belief = FilterBelief(settings.grounds)
+    def __init__(self, prior: Array) -> None:
+        self._prior, self._belief = prior, FilterBelief(grounds_of(len(prior)))
         self._end_s = math.nan
 
     def take(
@@ -207,7 +181,7 @@ class LiveTerrainFilter:
         if dt_s > 0.0 or math.isnan(self._end_s):
             self._end_s = end_s
             evidence = float(novelty_evidence(np.array([novelty]), np.array([unknown]))[0])
-            self._belief = filter_step(self._belief, probability, dt_s, self.settings, evidence)
+            self._belief = filter_step(self._belief, probability, dt_s, self._prior, evidence)
         belief = self._belief.probability
-        best = int(reported(belief[None], self.settings.threshold)[0])
+        best = int(reported(belief[None])[0])
         return best, float(belief[best]) if best >= 0 else math.nan

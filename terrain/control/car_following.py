@@ -316,8 +316,8 @@ _NO_GRIP = Grip(math.nan, math.nan)
 class CarFollower:
     """Controller of a drive along a path, for :func:`terrain.simulation.plants.car.run_car`.
 
-    The sideslip is from the observer of a source, of ``none`` one whose slip stays 0, or from another observer; ``ticks``
-    are what was known and done, in the order of time.
+    The sideslip is from the observer of a source, of ``none`` one whose slip stays 0, or from another observer;
+    ``ticks`` are what was known and done, in the order of time.
     """
 
     def __init__(

@@ -235,9 +235,9 @@ def _largest(values: Array) -> float:
     return float(known.max()) if known.size else math.nan
 
 
-def judge(figures: FaultFigures, nature: Nature, limits: Limits = LIMITS) -> dict[str, bool | None]:
+def judge(figures: FaultFigures, nature: Nature) -> dict[str, bool | None]:
     """Return which of :data:`BARS` are met; None where a figure is undefined, or a fault of that nature may miss it."""
-    one = figures
+    one, limits = figures, LIMITS
     error_limit = max(
         limits.slip_error_ratio, one.clean_slip_error_ratio + limits.slip_error_chance_ratio
     )  # the clean drive's error is NaN where it has none: the first then
@@ -269,11 +269,11 @@ class BarCount(NamedTuple):
     n_not_judged: int
 
 
-def count_bars(judged: Sequence[Mapping[str, bool | None]], limits: Limits = LIMITS) -> dict[str, BarCount]:
+def count_bars(judged: Sequence[Mapping[str, bool | None]]) -> dict[str, BarCount]:
     """Return each bar by name, over the drives that were judged."""
     met = {name: [bars[name] for bars in judged] for name in BARS}
     return {
-        name: BarCount(text.format(**limits._asdict()), *map(met[name].count, (True, False, None)))
+        name: BarCount(text.format(**LIMITS._asdict()), *map(met[name].count, (True, False, None)))
         for name, text in BARS.items()
     }
 

@@ -122,11 +122,6 @@ class PidState(NamedTuple):
     error: float = math.nan
 
 
-def check_gains(gains: Gains) -> Gains:
-    """Return gains that can be used, as floats; else ``ConfigError``."""
-    return checked("gain ", gains, ("limit", "integral_limit"), ("integral_limit",))
-
-
 def pid_step(gains: Gains, state: PidState, error: float, dt_s: float) -> tuple[float, PidState, PidStatus]:
     """Return output, next state and status of one step.
 
@@ -135,7 +130,7 @@ def pid_step(gains: Gains, state: PidState, error: float, dt_s: float) -> tuple[
 
     Examples
     --------
-    >>> gains = check_gains(Gains(kp=1.0, ki=0.5, kd=0.0, limit=1.0))
+    >>> gains = Gains(kp=1.0, ki=0.5, kd=0.0, limit=1.0)
     >>> pid_step(gains, PidState(), 0.4, 0.1)[:2]
     (0.42000000000000004, PidState(integral=0.020000000000000004, error=0.4))
     >>> output, state, status = pid_step(gains, PidState(), 2.0, 0.1)

@@ -33,33 +33,28 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.control.path_tracking import SETTINGS as TRACKING
 from terrain.control.path_tracking import (
     TrackReport,
-    TrackSettings,
     TrackState,
     TrackStatus,
     check_tracking,
     track_step,
 )
-from terrain.control.pid import LONGEST_STEP_S, DriveState, Gains, WheelPid, check_gains, wheel_step
+from terrain.control.pid import LONGEST_STEP_S, DriveState, Gains, WheelPid, wheel_step
 from terrain.control.slip_table import DRIVE_STATES, CurveEntry, SlipTable
 from terrain.control.stability import check_stable
 from terrain.control.switching import (
     SWITCHING,
     OutputStatus,
-    SwitchSettings,
     TerrainBelief,
     approach,
-    check_switching,
     drive_on,
 )
-from terrain.control.traction import SETTINGS as TRACTION
 from terrain.control.traction import (
-    TractionSettings,
     TractionState,
     TractionStatus,
     TractionTarget,
     WheelMotion,
     WheelReport,
-    check_settings,
+    settings_of,
     traction_step,
 )
 from terrain.errors import ConfigError
@@ -86,12 +81,8 @@ class PilotSettings:
 
     controller: str = "traction"  # one of :data:`CONTROLLERS`
     ramp_mps2: float = 0.5  #: largest rise of the speed of the fastest wheel, of ``ramp``
-    traction: TractionSettings = TRACTION
-    switching: SwitchSettings = SWITCHING
-    gains: Gains = THESIS_GAINS  #: of ``thesis``
     delay_s: float = 0.05  #: from a sample to the wheel; the loops have to be stable with it
     track: bool = False  #: with path tracking; not with ``plain`` and ``ramp``, which estimate no pose
-    tracking: TrackSettings = TRACKING
     #: motors follow this pilot's commands, and are compared; not where a log is replayed
     follows: bool = True
 
@@ -100,7 +91,7 @@ DEFAULT_SETTINGS = PilotSettings()
 
 
 def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> SwerveRobot:
-    """Return a robot that can be driven; ``ConfigError`` as a pilot, but for settings of traction and tracking."""
+    """Return a robot that can be driven; ``ConfigError`` as a pilot, but for path tracking."""
     if settings.controller not in CONTROLLERS:
         raise ConfigError(
             f"controller {settings.controller!r} is unknown: use one of {', '.join(CONTROLLERS)}"
@@ -109,11 +100,10 @@ def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> Swer
     if not 0.0 < settings.ramp_mps2 < math.inf:
         raise ConfigError(f"ramp_mps2 is {settings.ramp_mps2!r}, a number above zero is required")
     check_table(table, robot.name)
-    check_switching(settings.switching)
     if settings.track and settings.controller in OPEN_LOOP:
         raise ConfigError(f"controller {settings.controller!r} estimates no pose: it has no path tracking")
     if settings.controller == "thesis":
-        check_stable(swerve, settings.gains, settings.delay_s)
+        check_stable(swerve, THESIS_GAINS, settings.delay_s)
     return swerve
 
 
@@ -324,7 +314,7 @@ class RobotControl:
     Raises
     ------
     ConfigError
-        if a setting of traction or tracking is not accepted.
+        if path tracking is unstable on the robot, with its delay.
     """
 
     def __init__(
@@ -334,13 +324,12 @@ class RobotControl:
         self._radius_m, self._positions_m = robot.wheel_radius_m, np.array(robot.wheel_positions_m)
         motors, steering = robot.equipment.motors, robot.equipment.steering
         self._limits = robot.wheel_radius_m, motors.speed_max_radps, steering.rate_max_radps
-        self._traction = check_settings(settings.traction, robot)
-        self._gains = check_gains(settings.gains) if settings.controller == "thesis" else settings.gains
+        self._traction = settings_of(robot)
         if states:
             self._steer_states = np.array([states.index(f"steer_{i}_rad") for i in robot.wheels])
             self._pose_states = [states.index(state) for state in ("position_x_m", "position_y_m", "yaw_rad")]
             if settings.track:
-                self._track_settings = check_tracking(robot, settings.tracking, settings.delay_s)
+                check_tracking(robot, TRACKING, settings.delay_s)
         self._actuation = Actuation(robot.wheel_radius_m / motors.reduction_ratio)
         self.use(table)
         # what a step leaves to the next
@@ -418,7 +407,7 @@ class RobotControl:
         )
         desired_mps = max(map(abs, wheel_radps.tolist())) * self._radius_m
         if not holds:
-            belief = drive_on(belief, desired_mps, step_s, self._settings.switching)
+            belief = drive_on(belief, desired_mps, step_s)
         observed = _NOT_ESTIMATED
         if self._estimates:
             observed = observe_wheels(self._robot, self._steer_states, seen, time_s)
@@ -485,7 +474,7 @@ class RobotControl:
         rows, chassis_mps, wheels = (column.tolist() for column in columns), seen.chassis_mps, []
         for i, (rate, measured, speed, accel) in enumerate(zip(*rows, strict=True)):
             given = rate, measured, speed, accel, chassis_mps, targets, dt_s
-            wheel, self._pids[i] = wheel_step(self._gains, radius_m, self._pids[i], *given)
+            wheel, self._pids[i] = wheel_step(THESIS_GAINS, radius_m, self._pids[i], *given)
             wheels.append(wheel)
         desired = np.array([one.desired_ratio for one in wheels])
         status = TractionStatus.OK if np.isfinite(desired).all() else TractionStatus.NO_SLIP
@@ -516,8 +505,7 @@ class RobotControl:
     def _target(self, terrain: str, seen: LiveEstimate | None, dt_s: float) -> TractionTarget:
         """Return the slips to aim for; the target moves to that of the terrain at a bounded rate."""
         level = self._targets.get(terrain) or self._targets[self._table.fallback]
-        rate_ratio = self._settings.switching.rate_ratio
-        self.target_ratio = approach(self.target_ratio, level.traction_ratio, rate_ratio, dt_s)
+        self.target_ratio = approach(self.target_ratio, level.traction_ratio, SWITCHING.rate_ratio, dt_s)
         target = level._replace(traction_ratio=self.target_ratio)
         if target.braking_mps2 == 0.0:
             return target
@@ -536,7 +524,7 @@ class RobotControl:
         turns, seen_yaw, camera = (self.health[i] for i in (_GYRO, _SEEN_YAW, _SEEN))
         is_sound = min(turns, seen_yaw) <= SOUND and (camera <= SOUND or camera == Health.LOST)
         twist, self._tracking, report = track_step(
-            self._track_settings,
+            TRACKING,
             self._tracking,
             twist,
             seen.mean[self._pose_states],

@@ -37,7 +37,7 @@ from itertools import product
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.pid import LOW_SPEED_MPS, Gains, check_gains
+from terrain.control.pid import LOW_SPEED_MPS, Gains
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
@@ -61,14 +61,11 @@ def check_stable(
     robot: Robot,
     gains: Gains,
     delay_s: float = DELAY_S,
-    *,
-    dt_s: float = SAMPLE_TIME_S,
-    low_speed_mps: float = LOW_SPEED_MPS,
 ) -> float:
     """Return the factor on all gains at which the loop becomes unstable somewhere in the robot's range of operation.
 
-    It is above 1, and infinite for none; ``ConfigError`` is raised if the loop is unstable at some speed, or a gain
-    or a time is not accepted.  The delay is from measurement to command, beside the encoders' low-pass; below the
+    It is above 1, and infinite for none; ``ConfigError`` is raised if the loop is unstable at some speed, or the delay
+    is not accepted.  The delay is from measurement to command, beside the encoders' low-pass; below the
     low speed the controller is inactive.
 
     Examples
@@ -82,18 +79,11 @@ def check_stable(
     terrain.errors.ConfigError: robot agrimaro: slip control (kp 2, ki 0, kd 0) with a delay of 0.05 s is
     unstable from 0.05 to 2 m/s; it is stable up to 0.76 times these gains
     """
-    gains = check_gains(gains)
-    _samples_of(delay_s, dt_s)
     fastest_mps = robot.wheel_radius_m * robot.equipment.motors.speed_max_radps
-    if not 0 < low_speed_mps < fastest_mps:
-        raise ConfigError(
-            f"low_speed_mps is {low_speed_mps!r}, above 0 and below {fastest_mps:g} is required"
-        )
-    speeds_mps = np.geomspace(low_speed_mps, fastest_mps, N_SPEEDS).tolist()
+    speeds_mps = np.geomspace(LOW_SPEED_MPS, fastest_mps, N_SPEEDS).tolist()
     places = list(product(speeds_mps, SLIPS, SLOPES))
     without, loops = (
-        loop_matrices(robot, one, delay_s, places, dt_s=dt_s)
-        for one in (gains._replace(kp=0.0, ki=0.0, kd=0.0), gains)
+        loop_matrices(robot, one, delay_s, places) for one in (gains._replace(kp=0.0, ki=0.0, kd=0.0), gains)
     )
 
     def radii(factor: float) -> Array:  # with all gains scaled: the matrix is linear in them
@@ -120,18 +110,19 @@ def loop_matrices(
     gains: Gains,
     delay_s: float,
     places: Sequence[tuple[float, float, float]],
-    *,
-    dt_s: float = SAMPLE_TIME_S,
 ) -> Array:
     """Return the closed loops (k, n, n) of ``pid_step`` and the plant from one sample to the next; without the drift.
 
     Parameters
     ----------
-    robot, gains, delay_s, dt_s : as :func:`check_stable` takes them
+    robot, gains, delay_s : as :func:`check_stable` takes them
     places : (k) of V in m/s, the larger of wheel circumferential speed and ground speed; slip s_0; slope c in
         loads
     """
-    n_delayed, radius_m = _samples_of(delay_s, dt_s), robot.wheel_radius_m
+    if not 0 <= delay_s <= LONGEST_DELAY_S:
+        raise ConfigError(f"delay_s is {delay_s!r}, 0 to {LONGEST_DELAY_S:g} s is required")
+    dt_s, radius_m = SAMPLE_TIME_S, robot.wheel_radius_m
+    n_delayed = math.ceil(delay_s / dt_s - 1e-9)
     (body, motors, _, _, sensors), third_kg = robot.equipment, robot.mass_kg / 3
     rate, speed, contact, torque, q, estimate, measured, command = np.eye(8)  # w, v, k, T, q, e, y, u
     lags_s = (
@@ -206,12 +197,3 @@ def closed_loop(keep: Array, drive: Array, controller: Array, output: Array, n_d
         applied = np.eye(size)[-1]
     loop[:n] += np.outer(drive, applied)
     return loop
-
-
-def _samples_of(delay_s: float, dt_s: float) -> int:
-    """Return a delay in samples, rounded up; ``ConfigError`` where it or the sample time is not accepted."""
-    if not 0 < dt_s <= LONGEST_DELAY_S:
-        raise ConfigError(f"dt_s is {dt_s!r}, above 0 and up to {LONGEST_DELAY_S:g} s is required")
-    if not 0 <= delay_s <= LONGEST_DELAY_S:
-        raise ConfigError(f"delay_s is {delay_s!r}, 0 to {LONGEST_DELAY_S:g} s is required")
-    return math.ceil(delay_s / dt_s - 1e-9)

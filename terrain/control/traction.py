@@ -41,7 +41,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.control.pid import LONGEST_STEP_S, DriveState, checked
+from terrain.control.pid import LONGEST_STEP_S, DriveState
 from terrain.records import Array
 from terrain.robots import Robot
 from terrain.status import StatusCode
@@ -71,7 +71,7 @@ class TractionSettings(NamedTuple):
     stale_max_s: float = 3.0
     brake_lead_s: float = 0.15  #: age of the ground speed during a braking
     #: what a motor driver's integral needs to carry the torque of a braking, as a speed by its proportional gain, and
-    #: its time constant; see :func:`check_settings`
+    #: its time constant; see :func:`settings_of`
     charge_mps_per_mps2: float = 0.0
     charge_time_s: float = 0.2
 
@@ -102,8 +102,8 @@ class WheelMotion(NamedTuple):
     stale_s: float  #: since the speed over ground was measured last; infinite before the first time
 
 
-def check_settings(settings: TractionSettings, robot: Robot | None = None) -> TractionSettings:
-    """Return settings that can be used, with what a robot's motor drivers need to change their torque.
+def settings_of(robot: Robot) -> TractionSettings:
+    """Return the settings, with what a robot's motor drivers need to change their torque.
 
     A PI speed loop carries a change of torque T by its error until its integral has taken it over: an error
     of ``T / K_P`` with the time constant ``K_P / K_I``.  At a deceleration a, each of n wheels carries
@@ -112,16 +112,13 @@ def check_settings(settings: TractionSettings, robot: Robot | None = None) -> Tr
     Examples
     --------
     >>> from terrain.robots import load_robot
-    >>> round(check_settings(SETTINGS, load_robot("agrimaro")).charge_mps_per_mps2, 3)
+    >>> round(settings_of(load_robot("agrimaro")).charge_mps_per_mps2, 3)
     0.1
     """
-    settings = checked("traction: ", settings, ("launch_mps", "droop_time_s", "charge_time_s"))
-    if robot is None:
-        return settings
     motors = robot.equipment.motors
     torque = robot.mass_kg * robot.wheel_radius_m / len(robot.wheels)
     integral = motors.speed_integral_nmpr
-    return settings._replace(
+    return SETTINGS._replace(
         charge_mps_per_mps2=torque / motors.speed_gain_nmspr * robot.wheel_radius_m,
         charge_time_s=motors.speed_gain_nmspr / integral if integral > 0 else 1e6,
     )

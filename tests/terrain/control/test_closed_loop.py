@@ -10,7 +10,7 @@ import pytest
 from terrain.control.controllers import make_controller
 from terrain.control.drive_metrics import distance_within, drive_history, final_speed, slip_peak
 from terrain.control.path_tracking import SETTINGS as TRACKING
-from terrain.control.path_tracking import TrackState, TrackStatus, check_tracking, track_step
+from terrain.control.path_tracking import TrackState, TrackStatus, track_step
 from terrain.control.robot_control import OPEN_LOOP, RobotControl
 from terrain.control.situations import SituationOptions, make_situation, simulate_situation, start_times
 from terrain.control.slip_table import load_slip_table
@@ -101,9 +101,9 @@ def off_the_path(scenario, terrain, seed, duration_s):
     pose = at(truth.time_s, [truth.channel(name) for name in ("position_x_m", "position_y_m", "yaw_rad")])
     ground = at(truth.time_s, [truth.channel(name) for name in TWIST])
     desired = at(situation.scenario.time_s, situation.scenario.twist.T)
-    settings, state, off_m = check_tracking(ROBOT, TRACKING, DELAY_S), TrackState(), []
+    state, off_m = TrackState(), []
     for place, twist, motion in zip(pose, desired, ground, strict=True):
-        _, state, report = track_step(settings, state, twist, place, motion, 0.0, 0.0, 0.02)
+        _, state, report = track_step(TRACKING, state, twist, place, motion, 0.0, 0.0, 0.02)
         off_m.append(abs(report.cross_track_m))
     tracked = np.isin(control.channel("track_status_code"), (TrackStatus.OK, TrackStatus.CLAMPED))
     good = tracked & (control.channel("status_code") == TractionStatus.OK)

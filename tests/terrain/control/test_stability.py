@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.pid import Gains, PidState, check_gains, pid_step
+from terrain.control.pid import Gains, PidState, pid_step
 from terrain.control.stability import DELAY_S, SLOPES, check_stable, loop_matrices
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
@@ -84,7 +84,7 @@ def small_changes(gains, n_delayed, speed_mps, slip_ratio, slope_ratio, n_sample
 )
 def test_a_small_change_grows_or_decays_by_the_largest_eigenvalue(numbers, n_delayed, where):
     kp, ki, kd, tau_s = numbers
-    gains = check_gains(Gains(kp, ki, kd, MOST_RADPS, derivative_time_constant_s=tau_s))
+    gains = Gains(kp, ki, kd, MOST_RADPS, derivative_time_constant_s=tau_s)
     matrix = loop_matrices(ROBOT, gains, n_delayed * DT_S, [where])[0]
     slip = np.abs(small_changes(gains, n_delayed, *where, 500))
     early, late = slip[150:250].max(), slip[400:500].max()  # a hundred samples hold a whole swing
@@ -108,11 +108,8 @@ def test_the_margin_is_the_same_at_any_speed():
             {"gains": Gains(2.0, 0.0, 0.0, 5.0)},
             r"unstable from 0\.05 to 2 m/s; it is stable up to 0\.76 times",
         ),
-        ({"gains": Gains(-1.0, 0.0, 0.0, 5.0)}, "^gain kp is -1"),
         ({"delay_s": math.nan}, "^delay_s is nan, 0 to 1 s is required"),
         ({"delay_s": -0.1}, "^delay_s is -0.1"),
-        ({"dt_s": 0.0}, "^dt_s is 0.0"),
-        ({"low_speed_mps": 2.0}, "^low_speed_mps is 2.0, above 0 and below 2 is required"),
         ({"robot": load_robot("husky")}, "^robot husky: its description has no section"),
     ],
 )

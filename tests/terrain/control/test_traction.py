@@ -12,7 +12,7 @@ from terrain.control.traction import (
     TractionStatus,
     TractionTarget,
     WheelMotion,
-    check_settings,
+    settings_of,
     traction_step,
 )
 from terrain.kinematics.commands import inverse
@@ -161,7 +161,7 @@ def numbers_of(state):
 def test_any_drive_with_faults_equals_the_reference_implementation(seed):
     rng = np.random.default_rng(seed)
     changes = {"launch_mps": float(rng.choice([0.01, 0.22])), "droop_time_s": 0.2, "fade_mps2": 1.07}
-    using = check_settings(SETTINGS._replace(**changes), ROBOT)  # no step of a fade is a threshold's
+    using = settings_of(ROBOT)._replace(**changes)  # no step of a fade is a threshold's
     aim = TractionTarget(rng.uniform(0, 0.6), *(rng.choice([[0.0, 0.0, 0.0], [0.15, 3.0, 0.05]])))
     memory, state = remembered(), TractionState()
     desired, v, bits = rng.choice([-1, 1], 3) * rng.uniform(0.2, 5, 3), 0.0, rng.uniform(0, 0.1)
