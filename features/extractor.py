@@ -343,14 +343,12 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
             raise DataError(f"the windows hold no channel of the signal sets {', '.join(self.signal_sets)}")
         return self
 
-    def transform(self, X: Windows | Mapping[str, Array]) -> Array:
+    def transform(self, X: Windows) -> Array:
         """Return the features (n_windows, n_features); NaN where a feature is not defined.
 
-        Besides windows, plain arrays by stream ``(n_windows, n_channels, n_samples)`` are taken, with the
-        channels and rates of ``fit``; this is the form in which a model server passes them.  ``DataError`` where
-        the windows are of another kind than those of ``fit``.
+        ``DataError`` where the windows are of another kind than those of ``fit``.
         """
-        return self.matrix.of(self._windows(X))
+        return self.matrix.of(X)
 
     @property
     def matrix(self) -> FeatureMatrix:
@@ -362,23 +360,6 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
         """Return the name of each column with its unit."""
         check_is_fitted(self)
         return np.array([feature.label for feature in self.features_], dtype=object)
-
-    def _windows(self, X: Windows | Mapping[str, Array]) -> Windows:
-        check_is_fitted(self)
-        if isinstance(X, Windows):
-            return X
-        channels, rate_hz = self.layout_.channels, self.layout_.rate_hz
-        for stream, names in channels.items():
-            n_samples = self.layout_.n_samples(stream, self.length_s_)
-            shape = np.shape(X[stream]) if stream in X else None
-            if shape is None or shape[1:] != (len(names), n_samples):
-                raise DataError(
-                    f"stream {stream!r} has the shape {shape}; (windows, {len(names)}, {n_samples}) is needed"
-                )
-        values = {stream: np.asarray(X[stream], dtype=float) for stream in channels}
-        n = len(next(iter(values.values())))
-        unknown = np.full(n, "", dtype=object)
-        return Windows(values, channels, rate_hz, self.length_s_, np.zeros(n), unknown, unknown)
 
 
 @dataclass(eq=False, repr=False)
@@ -415,11 +396,10 @@ class SampleExtractor(FeatureExtractor):
         )
         return self
 
-    def transform(self, X: Windows | Mapping[str, Array]) -> Array:
+    def transform(self, X: Windows) -> Array:
         """Return the matrix (n_windows, n_columns); errors as of the features."""
-        windows = self._windows(X)
-        samples = self.matrix.samples(windows)
-        return np.concatenate([self.matrix.of(windows), samples], axis=1) if self.with_features else samples
+        samples = self.matrix.samples(X)
+        return np.concatenate([self.matrix.of(X), samples], axis=1) if self.with_features else samples
 
     def get_feature_names_out(self, input_features: Any = None) -> Array:
         """Return the name of each column with its unit."""
@@ -492,22 +472,21 @@ class FunctionExtractor(FeatureExtractor):
         self.own_names_ = tuple(self._numbers(X, 0)[1]) if len(X) else ()
         return self
 
-    def transform(self, X: Windows | Mapping[str, Array]) -> Array:
+    def transform(self, X: Windows) -> Array:
         """Return the matrix (n_windows, n_columns); errors as of features.
 
         ``ConfigError`` where a function fails, or gives what is no number or has other names than in ``fit``.
         """
-        windows = self._windows(X)
-        own = np.empty((len(windows), len(self.own_names_)))
-        for row in range(len(windows)):
-            place, numbers = self._numbers(windows, row)
+        own = np.empty((len(X), len(self.own_names_)))
+        for row in range(len(X)):
+            place, numbers = self._numbers(X, row)
             if tuple(numbers) != self.own_names_:
                 raise ConfigError(
                     f"own features of {place} are {', '.join(numbers)}; those of the first window are "
                     f"{', '.join(self.own_names_)}"
                 )
             own[row] = list(numbers.values())
-        return np.concatenate([super().transform(windows), own], axis=1)
+        return np.concatenate([super().transform(X), own], axis=1)
 
     def get_feature_names_out(self, input_features: Any = None) -> Array:
         """Return the name of each column, of the package's own features with the unit."""

@@ -53,9 +53,9 @@ class ResponseExtractor(FeatureExtractor):
         self.columns_ = ResponseColumns(n_wheels, len(names) - n_wheels)
         return self
 
-    def transform(self, X: Windows | Mapping[str, Array]) -> Array:
+    def transform(self, X: Windows) -> Array:
         """Return the matrix (n_windows, n_wheels + n_responses); NaN where a window has no sample."""
-        values = self.matrix.selected(self._windows(X))
+        values = self.matrix.selected(X)
         speeds = np.stack([_channel(values, self.layout_.channels, name) for name in self._speed_names()], 1)
         norm = np.linalg.norm(speeds, axis=1)
         turning = norm >= MIN_TURNING * np.median(norm, axis=1, keepdims=True)

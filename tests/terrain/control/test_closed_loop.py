@@ -9,15 +9,11 @@ import pytest
 
 from terrain.control.controllers import make_controller
 from terrain.control.drive_metrics import distance_within, drive_history, final_speed, slip_peak
-from terrain.control.path_tracking import SETTINGS as TRACKING
-from terrain.control.path_tracking import TrackState, TrackStatus, track_step
 from terrain.control.robot_control import OPEN_LOOP, RobotControl
 from terrain.control.situations import SituationOptions, make_situation, simulate_situation, start_times
 from terrain.control.slip_table import load_slip_table
 from terrain.control.switching import OutputStatus, TerrainBelief
-from terrain.control.traction import TractionStatus
 from terrain.estimation.live import LiveFilter
-from terrain.logs.replay import TWIST
 from terrain.robots import load_robot
 from terrain.simulation.scenario import Faults
 
@@ -85,31 +81,6 @@ def test_a_wrong_target_costs_no_speed_on_dry_sand(target):
     assert limited == pytest.approx(plain, rel=0.005)
 
 
-def off_the_path(scenario, terrain, seed, duration_s):
-    """Return the distance from the path at each step with a good status, and how many steps have one.
-
-    The path is that of the tracking itself, fed with the true motion: it starts anew at each standstill, and
-    the robot is on it wherever along it slip has let it come.
-    """
-    run, situation = driven("fallback+track", scenario, terrain, seed, duration_s=duration_s)
-    truth, control = run.streams["truth"], run.streams["control"]
-    time_s = control.time_s
-
-    def at(source_s, columns):
-        return np.column_stack([np.interp(time_s, source_s, column) for column in columns])
-
-    pose = at(truth.time_s, [truth.channel(name) for name in ("position_x_m", "position_y_m", "yaw_rad")])
-    ground = at(truth.time_s, [truth.channel(name) for name in TWIST])
-    desired = at(situation.scenario.time_s, situation.scenario.twist.T)
-    state, off_m = TrackState(), []
-    for place, twist, motion in zip(pose, desired, ground, strict=True):
-        _, state, report = track_step(TRACKING, state, twist, place, motion, 0.0, 0.0, 0.02)
-        off_m.append(abs(report.cross_track_m))
-    tracked = np.isin(control.channel("track_status_code"), (TrackStatus.OK, TrackStatus.CLAMPED))
-    good = tracked & (control.channel("status_code") == TractionStatus.OK)
-    return np.array(off_m)[good], good
-
-
 def test_tracking_holds_on_a_side_slope_with_backlash_and_without_a_camera():
     ends, options = {}, SituationOptions(duration_s=23.0, leg_backlash_rad=0.02)
     where = make_situation("straight", ROBOT, "grass", 200, options)
@@ -121,21 +92,3 @@ def test_tracking_holds_on_a_side_slope_with_backlash_and_without_a_camera():
         ends[name] = np.array(moved)
     assert ends["plain"][0] > 1.0
     assert (ends["fallback+track"] < [0.1 * ends["plain"][0], 0.3 * ends["plain"][1]]).all()
-
-
-TEN_MINUTES = [
-    (scenario, soil) for scenario in ("straight", "complex") for soil in ("tiles", "grass", "dry_sand")
-]
-
-
-@pytest.mark.parametrize(
-    ("scenario", "terrain", "duration_s"),
-    [
-        ("complex", "tiles", 60.0),
-        *(pytest.param(*each, 600.0, marks=pytest.mark.slow) for each in TEN_MINUTES),
-    ],
-)
-def test_a_minute_or_ten_on_the_path(scenario, terrain, duration_s):
-    off_m, good = off_the_path(scenario, terrain, 63, duration_s)
-    assert np.nanmax(off_m) < 0.3
-    assert good.mean() > 0.5  # the others stand
