@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy.optimize import least_squares
-from sklearn.metrics import confusion_matrix
+from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
 
 from terrain.bootstrap import bootstrap_counts, bootstrap_rows, percentile_interval, stratified_counts
 from terrain.classify.held_out import CURVE_DRAWS, HeldOut, Scored
@@ -115,17 +115,21 @@ def class_figures(y: Array, predicted: Array, classes: Array) -> dict[str, Any]:
 
     Rows of ``confusion`` are true classes, columns predicted ones.
     """
-    confusion = confusion_matrix(y, predicted, labels=classes)
-    hits, n_true, n_predicted = confusion.diagonal(), confusion.sum(axis=1), confusion.sum(axis=0)
-    precision, recall = hits / np.maximum(n_predicted, 1), hits / np.maximum(n_true, 1)
-    f1 = 2 * hits / np.maximum(n_true + n_predicted, 1)
-    columns = precision.tolist(), recall.tolist(), f1.tolist(), n_true.tolist()
+    precision, recall, f1, n_true = columns = precision_recall_fscore_support(
+        y, predicted, labels=classes, zero_division=0.0
+    )
     return {
         "accuracy": float(np.mean(y == predicted)),
         "balanced_accuracy": float(recall[n_true > 0].mean()),
         "macro_f1": float(f1[n_true > 0].mean()),
-        "per_class": dict(zip(classes.astype(str).tolist(), map(ClassFigures, *columns), strict=True)),
-        "confusion": tuple(map(tuple, confusion.tolist())),
+        "per_class": dict(
+            zip(
+                classes.astype(str).tolist(),
+                map(ClassFigures, *(each.tolist() for each in columns)),
+                strict=True,
+            )
+        ),
+        "confusion": tuple(map(tuple, confusion_matrix(y, predicted, labels=classes).tolist())),
     }
 
 

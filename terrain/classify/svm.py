@@ -32,12 +32,12 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field
 from scipy.optimize import minimize_scalar
+from scipy.special import expit
 from sklearn.svm import SVC
 
 from terrain.classify.folds import TOO_FEW, inner_splits
 from terrain.classify.grouped import GroupedClassifier, fit_preparation
 from terrain.errors import DataError
-from terrain.kernels import njit
 from terrain.records import Array
 
 #: Margins of support vectors are 1: beyond these bounds probabilities of the pairs are flat or 0 and 1.
@@ -65,66 +65,19 @@ def class_probabilities(margins: Array, n_classes: int, scale: float) -> Array:
     array([[0.79, 0.11, 0.11],
            [0.5 , 0.  , 0.5 ]])
     """
-    found: Array = _coupled(np.ascontiguousarray(margins, dtype=np.float64), n_classes, float(scale))
-    return found
-
-
-@njit(nogil=True, error_model="numpy")
-def _coupled(margins: Array, n_classes: int, scale: float) -> Array:
-    probability = np.zeros((margins.shape[0], n_classes))
-    ratio = np.empty((n_classes, n_classes))
-    system = np.empty((n_classes, n_classes))
-    solution = np.empty(n_classes)
-    known = np.empty(n_classes, dtype=np.bool_)
-    for n in range(margins.shape[0]):
-        known[:] = False
-        pair = 0
-        for a in range(n_classes):
-            for b in range(a + 1, n_classes):
-                if not np.isnan(margins[n, pair]):
-                    known[a] = known[b] = True
-                r = 1.0 / (1.0 + np.exp(-scale * margins[n, pair]))
-                r = min(max(r, MIN_PAIR_PROBABILITY), 1.0 - MIN_PAIR_PROBABILITY)
-                ratio[a, b], ratio[b, a] = r, 1.0 - r
-                pair += 1
-        present = np.flatnonzero(known)
-        k = present.size
-        for i in range(k):
-            system[i, i] = 1.0
-            for j in range(k):
-                if j != i:
-                    back = ratio[present[j], present[i]]
-                    system[i, i] += back * back
-                    system[i, j] = 1.0 - back * ratio[present[i], present[j]]
-        _solve_ones(system, solution, k)
-        total = 0.0
-        for i in range(k):
-            solution[i] = max(solution[i], 0.0)  # -1e-17 of rounding
-            total += solution[i]
-        for i in range(k):
-            probability[n, present[i]] = solution[i] / total
-    return probability
-
-
-@njit(nogil=True, error_model="numpy")
-def _solve_ones(system: Array, solution: Array, k: int) -> None:
-    """Solve ``system z = 1`` of the first k, symmetric and positive definite, by Cholesky's ``L L'`` in its place."""
-    for i in range(k):
-        for j in range(i + 1):
-            total = system[i, j]
-            for m in range(j):
-                total -= system[i, m] * system[j, m]
-            system[i, j] = np.sqrt(total) if i == j else total / system[j, j]
-    for i in range(k):
-        total = 1.0
-        for m in range(i):
-            total -= system[i, m] * solution[m]
-        solution[i] = total / system[i, i]
-    for i in range(k - 1, -1, -1):
-        total = solution[i]
-        for m in range(i + 1, k):
-            total -= system[m, i] * solution[m]
-        solution[i] = total / system[i, i]
+    a, b = np.triu_indices(n_classes, 1)
+    r = np.clip(expit(scale * margins), MIN_PAIR_PROBABILITY, 1.0 - MIN_PAIR_PROBABILITY)
+    ratio = np.zeros((len(margins), n_classes, n_classes))
+    ratio[:, a, b], ratio[:, b, a] = np.nan_to_num(r), np.nan_to_num(1.0 - r)
+    known: Array = ratio.max(axis=2) > 0.0
+    system = np.where(known[:, :, None] & known[:, None], 1.0 - ratio * ratio.swapaxes(1, 2), 0.0)
+    both = np.arange(n_classes)
+    system[:, both, both] = 1.0 + np.square(ratio).sum(
+        axis=1
+    )  # alone, a class that is not known has the solution 0
+    solution = np.linalg.solve(system, known[:, :, None].astype(float))[:, :, 0]
+    solution = np.maximum(solution, 0.0)  # -1e-17 of rounding
+    return np.asarray(solution / solution.sum(axis=1, keepdims=True))
 
 
 def fit_scale(margins: Array, class_index: Array, n_classes: int) -> float:
