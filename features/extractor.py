@@ -167,106 +167,6 @@ def is_centred(stream: str, channel: str, level_sets: Iterable[str]) -> bool:
     )
 
 
-class FeatureMatrix(NamedTuple):
-    """What features are computed from: channels and rates of streams, length of a window, samples of each stream.
-
-    ``level_sets`` are signal sets of which the statistics in :data:`LEFT_OUT` are computed as well.
-    """
-
-    layout: Layout
-    length_s: float
-    n_samples: Mapping[str, int]
-    level_sets: tuple[str, ...] = ()
-
-    def equals(self, other: FeatureMatrix) -> bool:
-        """Whether both give the same features of a window, but for rounding."""
-        own, its = ((m.layout.channels, dict(m.n_samples), m.length_s, m.level_sets) for m in (self, other))
-        its_hz, rates_hz = other.layout.rate_hz, self.layout.rate_hz.items()
-        return own == its and all(abs(rate / its_hz[name] - 1.0) <= SAME_RATE for name, rate in rates_hz)
-
-    def of(self, windows: Windows) -> Array:
-        """Return the features (n_windows, n_features), NaN where not defined; errors as :meth:`selected`."""
-        return self.named(windows)[1]
-
-    def named(self, windows: Windows) -> tuple[list[Feature], Array]:
-        """Return the features beside their values."""
-        selected, features, parts = self.selected(windows), list[Feature](), [np.empty((len(windows), 0))]
-        for stream, names in self.layout.channels.items():
-            values, rate_hz = selected[stream], self.layout.rate_hz[stream]
-            if stream == "slip":
-                all_names, columns, table = names, SLIP_STATISTICS, slip_statistics(values)
-            else:
-                derived, derived_names = derived_channels(values, names)
-                all_names, all_values = (*names, *derived_names), np.concatenate([values, derived], axis=1)
-                columns, table = STATISTICS, channel_statistics(all_values, rate_hz)
-                if values.shape[2] >= MIN_SAMPLES:
-                    columns = (*columns, *spectrum_names(values.shape[2]))
-                    table = np.concatenate([table, channel_spectra(all_values, rate_hz)], axis=2)
-            of_channels, kept = _described(stream, all_names, columns, frozenset(self.level_sets))
-            features += of_channels
-            parts.append(table[:, kept])
-            for quantities, signal_set in ((("gyro", "accel"), "imu"), (("current",), "currents")):
-                rows = [i for quantity in quantities for i in rows_of(names, quantity)]
-                parts.append(channel_correlations(values[:, rows]))
-                features += _pairs(stream, tuple(names[i] for i in rows), signal_set)
-        if selected:
-            of_speed = speed_features(selected, self.layout.channels)
-            features += of_speed[0]
-            parts.append(of_speed[1])
-        return features, np.concatenate(parts, axis=1)
-
-    def selected(self, X: Windows) -> dict[str, Array]:
-        """Return the samples of the channels that are used, by stream (n, channels, samples).
-
-        ``DataError`` where the windows lack a channel, or have another length, rate or number of samples.
-        """
-        if abs(X.length_s - self.length_s) > 1e-9:
-            raise DataError(
-                f"windows last {X.length_s:g} s; the features were learned on {self.length_s:g} s"
-            )
-        own = self.layout.channels.items()
-        missing = [f"{s}.{name}" for s, names in own for name in names if name not in X.channels.get(s, ())]
-        if missing:
-            listed = (
-                "; ".join(f"{stream} with {', '.join(names)}" for stream, names in channels.items())
-                for channels in (X.channels, self.layout.channels)
-            )
-            has, needed = (each or "no channel" for each in listed)
-            raise DataError(
-                f"the windows lack {', '.join(missing)}: they have {has}; the features were learned on {needed}"
-            )
-        values = {}
-        for stream, names in self.layout.channels.items():
-            rate_hz, n = X.rate_hz[stream], self.n_samples[stream]
-            array, held = X.values[stream], X.values[stream].shape[2]
-            if abs(rate_hz / self.layout.rate_hz[stream] - 1) > MAX_RATE_DEVIATION:
-                raise DataError(
-                    f"stream {stream!r} runs at {rate_hz:.4g} Hz; the features were learned at "
-                    f"{self.layout.rate_hz[stream]:.4g} Hz"
-                )
-            if abs(held - n) > MAX_RATE_DEVIATION * n + 1:
-                raise DataError(
-                    f"a window holds {held} samples of stream {stream!r}; the features were learned on {n}"
-                )
-            if names != tuple(X.channels[stream]):
-                array = array[:, [X.channels[stream].index(name) for name in names]]
-            # The number of samples follows the rate that was measured of a set of runs, from which the next set's
-            # differs by a little: where it gives a few less, the last ones are mirrored.
-            mirrored = held - 1 - np.abs(held - 1 - np.arange(n))
-            values[stream] = array if held == n else np.take(array, mirrored, axis=2)
-        return values
-
-    def samples(self, windows: Windows) -> Array:
-        """Return the samples (n_windows, n_columns) of all channels, stream by stream, centred where they must be."""
-        parts = []
-        for stream, values in self.selected(windows).items():
-            names = self.layout.channels[stream]
-            centred = np.array([is_centred(stream, name, self.level_sets) for name in names])[:, None]
-            mean = np.where(centred, values.mean(axis=2, keepdims=True), 0.0)
-            parts.append((values - mean).reshape(len(values), -1))
-        return np.concatenate(parts, axis=1)
-
-
 @lru_cache(maxsize=256)
 def _pairs(stream: str, channels: tuple[str, ...], signal_set: str) -> tuple[Feature, ...]:
     pairs = combinations([channel.rpartition("_")[0] for channel in channels], 2)
@@ -338,7 +238,7 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
         self.layout_ = Layout(channels, {stream: float(X.rate_hz[stream]) for stream in channels})
         self.length_s_ = float(X.length_s)
         self.n_samples_ = {stream: int(X.values[stream].shape[2]) for stream in channels}
-        self.features_ = self.matrix.named(X[:0])[0]
+        self.features_ = self.named(X[:0])[0]
         if not self.features_:
             raise DataError(f"the windows hold no channel of the signal sets {', '.join(self.signal_sets)}")
         return self
@@ -348,13 +248,98 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
 
         ``DataError`` where the windows are of another kind than those of ``fit``.
         """
-        return self.matrix.of(X)
+        return self.features_of(X)
 
-    @property
-    def matrix(self) -> FeatureMatrix:
-        """What the features are computed from."""
+    def equals(self, other: FeatureExtractor) -> bool:
+        """Whether both give the same features of a window, but for rounding."""
+        own, its = (
+            (m.layout_.channels, dict(m.n_samples_), m.length_s_, tuple(m.level_sets)) for m in (self, other)
+        )
+        its_hz, rates_hz = other.layout_.rate_hz, self.layout_.rate_hz.items()
+        return own == its and all(abs(rate / its_hz[name] - 1.0) <= SAME_RATE for name, rate in rates_hz)
+
+    def features_of(self, windows: Windows) -> Array:
+        """Return the features (n_windows, n_features), NaN where not defined; errors as :meth:`selected`."""
+        return self.named(windows)[1]
+
+    def named(self, windows: Windows) -> tuple[list[Feature], Array]:
+        """Return the features beside their values."""
+        selected, features, parts = self.selected(windows), list[Feature](), [np.empty((len(windows), 0))]
+        for stream, names in self.layout_.channels.items():
+            values, rate_hz = selected[stream], self.layout_.rate_hz[stream]
+            if stream == "slip":
+                all_names, columns, table = names, SLIP_STATISTICS, slip_statistics(values)
+            else:
+                derived, derived_names = derived_channels(values, names)
+                all_names, all_values = (*names, *derived_names), np.concatenate([values, derived], axis=1)
+                columns, table = STATISTICS, channel_statistics(all_values, rate_hz)
+                if values.shape[2] >= MIN_SAMPLES:
+                    columns = (*columns, *spectrum_names(values.shape[2]))
+                    table = np.concatenate([table, channel_spectra(all_values, rate_hz)], axis=2)
+            of_channels, kept = _described(stream, all_names, columns, frozenset(self.level_sets))
+            features += of_channels
+            parts.append(table[:, kept])
+            for quantities, signal_set in ((("gyro", "accel"), "imu"), (("current",), "currents")):
+                rows = [i for quantity in quantities for i in rows_of(names, quantity)]
+                parts.append(channel_correlations(values[:, rows]))
+                features += _pairs(stream, tuple(names[i] for i in rows), signal_set)
+        if selected:
+            of_speed = speed_features(selected, self.layout_.channels)
+            features += of_speed[0]
+            parts.append(of_speed[1])
+        return features, np.concatenate(parts, axis=1)
+
+    def selected(self, X: Windows) -> dict[str, Array]:
+        """Return the samples of the channels that are used, by stream (n, channels, samples).
+
+        ``DataError`` where the windows lack a channel, or have another length, rate or number of samples.
+        """
         check_is_fitted(self)
-        return FeatureMatrix(self.layout_, self.length_s_, self.n_samples_, tuple(self.level_sets))
+        if abs(X.length_s - self.length_s_) > 1e-9:
+            raise DataError(
+                f"windows last {X.length_s:g} s; the features were learned on {self.length_s_:g} s"
+            )
+        own = self.layout_.channels.items()
+        missing = [f"{s}.{name}" for s, names in own for name in names if name not in X.channels.get(s, ())]
+        if missing:
+            listed = (
+                "; ".join(f"{stream} with {', '.join(names)}" for stream, names in channels.items())
+                for channels in (X.channels, self.layout_.channels)
+            )
+            has, needed = (each or "no channel" for each in listed)
+            raise DataError(
+                f"the windows lack {', '.join(missing)}: they have {has}; the features were learned on {needed}"
+            )
+        values = {}
+        for stream, names in self.layout_.channels.items():
+            rate_hz, n = X.rate_hz[stream], self.n_samples_[stream]
+            array, held = X.values[stream], X.values[stream].shape[2]
+            if abs(rate_hz / self.layout_.rate_hz[stream] - 1) > MAX_RATE_DEVIATION:
+                raise DataError(
+                    f"stream {stream!r} runs at {rate_hz:.4g} Hz; the features were learned at "
+                    f"{self.layout_.rate_hz[stream]:.4g} Hz"
+                )
+            if abs(held - n) > MAX_RATE_DEVIATION * n + 1:
+                raise DataError(
+                    f"a window holds {held} samples of stream {stream!r}; the features were learned on {n}"
+                )
+            if names != tuple(X.channels[stream]):
+                array = array[:, [X.channels[stream].index(name) for name in names]]
+            # The number of samples follows the rate that was measured of a set of runs, from which the next set's
+            # differs by a little: where it gives a few less, the last ones are mirrored.
+            mirrored = held - 1 - np.abs(held - 1 - np.arange(n))
+            values[stream] = array if held == n else np.take(array, mirrored, axis=2)
+        return values
+
+    def samples(self, windows: Windows) -> Array:
+        """Return the samples (n_windows, n_columns) of all channels, stream by stream, centred where they must be."""
+        parts = []
+        for stream, values in self.selected(windows).items():
+            names = self.layout_.channels[stream]
+            centred = np.array([is_centred(stream, name, self.level_sets) for name in names])[:, None]
+            mean = np.where(centred, values.mean(axis=2, keepdims=True), 0.0)
+            parts.append((values - mean).reshape(len(values), -1))
+        return np.concatenate(parts, axis=1)
 
     def get_feature_names_out(self, input_features: Any = None) -> Array:
         """Return the name of each column with its unit."""
@@ -398,8 +383,8 @@ class SampleExtractor(FeatureExtractor):
 
     def transform(self, X: Windows) -> Array:
         """Return the matrix (n_windows, n_columns); errors as of the features."""
-        samples = self.matrix.samples(X)
-        return np.concatenate([self.matrix.of(X), samples], axis=1) if self.with_features else samples
+        samples = self.samples(X)
+        return np.concatenate([self.features_of(X), samples], axis=1) if self.with_features else samples
 
     def get_feature_names_out(self, input_features: Any = None) -> Array:
         """Return the name of each column with its unit."""

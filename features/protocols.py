@@ -245,7 +245,7 @@ def cut_partitions(
     for run_id, name, start in places:
         inside = regular_starts(start, start + PARTITION_S, rule.length_s, stride_s[name])
         starts_s.setdefault(run_id, []).extend(inside)
-    plain = WindowRule(rule.length_s, rule.stride_s, None, rule.max_gap_periods)
+    plain = WindowRule(rule.length_s, rule.stride_s, None)
     at = {run_id: np.array(each) for run_id, each in starts_s.items()}
     cut = labelled(cut_windows(runs, plain, layout=layout, starts_s=at, skip_short=True))
     partition = [

@@ -11,7 +11,6 @@ from sklearn.pipeline import Pipeline
 
 from features.extractor import (
     FeatureExtractor,
-    FeatureMatrix,
     FunctionExtractor,
     SampleExtractor,
     WindowFunction,
@@ -33,12 +32,6 @@ class WindowPipeline(Pipeline):
     The last step makes its inner folds of whole runs; ``cross_validate(recipe, windows, terrain,
     groups=windows.run_id)`` therefore needs no further argument.  ``classifier__groups`` overrides the run.
     """
-
-    @property
-    def matrix(self) -> FeatureMatrix:
-        """What the features are computed from, once fitted."""
-        found: FeatureMatrix = self[0].matrix
-        return found
 
     def fit(self, X: Windows, y: Any = None, **params: Any) -> WindowPipeline:
         """Fit all steps; the last one is given ``groups``, and which columns are samples."""

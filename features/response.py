@@ -55,7 +55,7 @@ class ResponseExtractor(FeatureExtractor):
 
     def transform(self, X: Windows) -> Array:
         """Return the matrix (n_windows, n_wheels + n_responses); NaN where a window has no sample."""
-        values = self.matrix.selected(X)
+        values = self.selected(X)
         speeds = np.stack([_channel(values, self.layout_.channels, name) for name in self._speed_names()], 1)
         norm = np.linalg.norm(speeds, axis=1)
         turning = norm >= MIN_TURNING * np.median(norm, axis=1, keepdims=True)

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from features.windows import TIME_TOLERANCE_S, Layout, WindowRule, cut_at, wheel_speeds
+from features.windows import MAX_GAP_PERIODS, TIME_TOLERANCE_S, Layout, WindowRule, cut_at, wheel_speeds
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.clocks import readable
 from terrain.estimation.live import Estimate, estimated_values
@@ -85,7 +85,7 @@ class WindowStream:
     """
 
     def __init__(self, rule: WindowRule, layout: Layout) -> None:
-        longest_step_s = max(rule.max_gap_periods / rate for rate in layout.rate_hz.values())
+        longest_step_s = max(MAX_GAP_PERIODS / rate for rate in layout.rate_hz.values())
         if not longest_step_s < PATIENCE_S:
             raise ConfigError(
                 f"a step of {longest_step_s:.3g} s is no gap; less than {PATIENCE_S:g} s is accepted"

@@ -33,6 +33,8 @@ RATE_SLACK = 0.1
 #: A window whose samples span this much more or less time than they should, and one period, was not sampled at the
 #: rate it is read with: a slow or a fast stretch of a logger, or a live stream set to another rate.
 SPAN_TOLERANCE = 0.1
+#: A longer step between two samples, in sample periods, is a gap: lets jitter through and catches one lost sample.
+MAX_GAP_PERIODS = 1.8
 DROP_REASONS = ("gap", "wrong rate", "not finite", "not moving", "not steady")
 
 
@@ -54,12 +56,9 @@ class WindowRule:
     stride_s: float | None = None  #: from start to start; ``None`` means one length, that is no overlap
     #: the rule of steady motion, ``None`` to keep every window
     steady: SteadyMotion | None = field(default_factory=SteadyMotion)
-    #: a longer step between two samples, in sample periods, is a gap; 1.8 lets jitter through and catches one lost
-    #: sample
-    max_gap_periods: float = 1.8
 
     def __post_init__(self) -> None:
-        for name in ("length_s", "stride_s", "max_gap_periods"):
+        for name in ("length_s", "stride_s"):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"window {name} is {value}; it must be positive and finite")
@@ -230,7 +229,7 @@ def cut_at(
         stream = streams[name]
         n = layout.n_samples(name, rule.length_s)
         period_s = 1 / layout.rate_hz[name]
-        limit_s = rule.max_gap_periods / layout.rate_hz[name]
+        limit_s = MAX_GAP_PERIODS / layout.rate_hz[name]
         first = np.searchsorted(stream.time_s, starts_s - TIME_TOLERANCE_S)
         complete = first + n <= len(stream)
         first = np.where(complete, first, 0)

@@ -98,7 +98,7 @@ class TerrainClassifier(ClassifierMixin, BaseEstimator):
             signal_sets=tuple(self.signal_sets),
             seed=self.seed,
         )
-        features, motion = recipe.matrix.of(windows), window_motion(windows)
+        features, motion = recipe[0].features_of(windows), window_motion(windows)
         self.model_, _ = with_limits(recipe, info, samples, features, motion)
         self.classes_ = np.asarray(recipe.classes_, dtype=object)
         return self

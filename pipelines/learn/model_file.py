@@ -120,7 +120,7 @@ def write_model(folder: Path, model: TerrainModel) -> None:
         (folder / name).unlink(missing_ok=True)
     atomic_write(folder / MODEL_FILE, content)
     if network is not None:
-        levels = model.recipe[0].matrix.level_sets
+        levels = model.recipe[0].level_sets
         centred = {
             each.stream: [is_centred(each.stream, name, levels) for name in each.channels]
             for each in network.columns
@@ -185,7 +185,7 @@ def read_model(source: str | Path) -> TerrainModel:
             check_support(support, info.classes)
         if novelty is not None:
             check_novelty(novelty, len(info.classes))
-            n_features = recipe.matrix.of(window).shape[1]
+            n_features = recipe[0].features_of(window).shape[1]
             if novelty.n_features != n_features:
                 raise DataError(f"its novelty score is of {novelty.n_features} features; it has {n_features}")
     except ConfigError:

@@ -88,8 +88,8 @@ def search(
     samples = data.samples
     examples = Examples(data.features, samples.terrain, samples.group)
     outer = folds_of(samples, "grouped", 1, seed)[0]
-    matrix = data.recipe.matrix
-    made_of = [dict(matrix.layout.channels), dict(matrix.layout.rate_hz), matrix.length_s, samples.gap]
+    first = data.recipe[0]
+    made_of = [dict(first.layout_.channels), dict(first.layout_.rate_hz), first.length_s_, samples.gap]
     content = {"version": VERSION, "space": SPACE, "data_digest": data.digest, "seed": seed, "cut": made_of}
     trials = _begin(folder, json.dumps(as_json(content), indent=2, sort_keys=True) + "\n")
     resumed = len(trials)

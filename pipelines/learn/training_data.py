@@ -61,7 +61,7 @@ class TrainingData:
     def features(self) -> Array:
         """Features (n, f) of the windows, which are the rows of most recipes."""
         plain = type(self.recipe[0]) is FeatureExtractor
-        return self.rows if plain else self.recipe.matrix.of(self.samples.windows)
+        return self.rows if plain else self.recipe[0].features_of(self.samples.windows)
 
     def probabilities(self, model: TerrainModel, rows: Array) -> Array | None:
         """Return what a model gives for some windows (m, k); None where it cannot be applied to them.
@@ -75,7 +75,7 @@ class TrainingData:
                 return np.asarray(recipe.predict_proba(windows[rows]))
             except DataError:
                 return None
-        if type(recipe[0]) is not FeatureExtractor or not recipe.matrix.equals(self.recipe.matrix):
+        if type(recipe[0]) is not FeatureExtractor or not recipe[0].equals(self.recipe[0]):
             return None
         return np.asarray(recipe[-1].predict_proba(self.rows[rows]))
 

@@ -98,7 +98,7 @@ def assess(model: TerrainModel, windows: Windows) -> Assessed:
     novelty = supported = np.full(len(windows), np.nan)
     features, recipe = None, model.recipe
     if model.novelty is not None:
-        features = recipe.matrix.of(windows)
+        features = recipe[0].features_of(windows)
         novelty = model.novelty.score(features)
     from_features = getattr(recipe, "probabilities", None)  # takes features that are there already
     probability = np.asarray(

@@ -115,9 +115,8 @@ def class_figures(y: Array, predicted: Array, classes: Array) -> dict[str, Any]:
 
     Rows of ``confusion`` are true classes, columns predicted ones.
     """
-    precision, recall, f1, n_true = columns = precision_recall_fscore_support(
-        y, predicted, labels=classes, zero_division=0.0
-    )
+    columns = precision_recall_fscore_support(y, predicted, labels=classes, zero_division=0.0)
+    _, recall, f1, n_true = columns
     return {
         "accuracy": float(np.mean(y == predicted)),
         "balanced_accuracy": float(recall[n_true > 0].mean()),

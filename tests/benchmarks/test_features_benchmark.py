@@ -145,7 +145,7 @@ def champion(windows):
     """Return the default recipe with all that a live window is asked, fitted on some windows."""
     terrain = windows.terrain.astype(str)
     recipe = make_recipe(candidates=[(10.0, 1.0, 80.0)]).fit(windows, terrain)
-    features, motion = recipe.matrix.of(windows), window_motion(windows)
+    features, motion = recipe[0].features_of(windows), window_motion(windows)
     moved = motion.speed_mps, motion.yaw_rate_radps
     support = learn_support(*moved, terrain, windows.run_id.astype(str), np.unique(terrain).tolist())
     return SimpleNamespace(

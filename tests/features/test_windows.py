@@ -117,7 +117,7 @@ def test_a_window_across_a_boundary_of_labels_has_no_label():
     assert list(cut_windows([run]).windows.terrain) == ["ice", "", "snow", "snow"]
 
 
-@pytest.mark.parametrize("name", ["length_s", "stride_s", "max_gap_periods"])
+@pytest.mark.parametrize("name", ["length_s", "stride_s"])
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
 def test_a_rule_refuses_what_is_not_positive(name, value):
     with pytest.raises(ConfigError, match=f"window {name} is {value}; it must be positive and finite"):

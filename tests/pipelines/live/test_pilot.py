@@ -75,7 +75,7 @@ def test_a_wrong_clock_causes_no_jump_and_no_end_of_slip_control(time_s):
         ("husky", {}, {}, "robot husky: drive 'skid_steer' has no pilot, only 'swerve' has"),
         ("agrimaro", {"robot": "o"}, {}, "slip table default: is of the robot 'o', not of 'agrimaro'"),
         ("agrimaro", {}, {"controller": "ramp", "ramp_mps2": 0.0}, "ramp_mps2 is 0.0"),
-        ("agrimaro", {}, {"controller": "thesis", "delay_s": 0.5}, "robot agrimaro: slip control (kp 0.5"),
+        ("agrimaro", {}, {"controller": "thesis", "delay_s": 1.0}, "robot agrimaro: slip control (kp 0.5"),
     ],
 )
 def test_invalid_settings_are_refused_in_one_sentence(robot, table, settings, message):
