@@ -11,13 +11,13 @@ from claims import Finding, Numbers, Trial
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
 from sklearn.model_selection import StratifiedKFold
+from stiffness import StiffnessLevel, cost_matrix, least_cost_class, response_of
 
 from features.extractor import FeatureExtractor
 from features.windows import cut_windows, join_windows
 from pipelines.report.figure import Band, Figure, Line, Panel
 from terrain.classify.folds import split_runs
 from terrain.classify.metrics import run_bootstrap
-from terrain.classify.stiffness import StiffnessLevel, cost_matrix, least_cost_class
 from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.constants import GRAVITY_MPS2
 from terrain.control.pid import (
@@ -54,7 +54,6 @@ from terrain.simulation.run import simulate_run
 from terrain.simulation.scenario import STAND_S, Faults
 from terrain.slip import MIN_SPEED_MPS
 from terrain.terramechanics.soil import load_soil, soil_names
-from terrain.terramechanics.stiffness import response_of
 
 ROBOT = "agrimaro"
 RUNS, FEW_RUNS = 5, 2

@@ -43,10 +43,8 @@ from terrain.classify.metrics import (
     set_figures,
     unknown_figures,
 )
-from terrain.classify.stiffness import stiffness_figures
 from terrain.classify.svm import GroupedSVC
 from terrain.records import Array
-from terrain.terramechanics.stiffness import known_levels
 
 CHECKED_WITH = FEATURE_RECIPE
 """The recipe of the checks beside the figures: they are of the data, and have many fits."""
@@ -205,7 +203,7 @@ def _extras(
 ) -> dict[str, Any]:
     """Return the checks beside the figures, by field."""
     classifier, features = _of_svm(recipe, features, samples, settings)
-    windows, terrain, run_id, seed = samples.windows, samples.terrain, samples.run_id, settings.seed
+    windows, terrain, seed = samples.windows, samples.terrain, settings.seed
     first = [result.fold for result in held_out.results if result.fold.repeat == 0]
 
     def accuracies(features: Array, folds: Sequence[Fold], task: str) -> list[float]:
@@ -231,7 +229,6 @@ def _extras(
         "speed_only_accuracy": speed_only,
         "slow_fast": slow_fast,
         "learning_curve": learning_curve(runs_per_class, curve, full),
-        "stiffness": stiffness_figures(held_out, run_id, known_levels(), seed),
         "courses": spliced,
         "recorded_courses": sequence_figures([track for track in tracks if not track.spliced], seed),
         "breakaways": breakaways(held_out, windows),

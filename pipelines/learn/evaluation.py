@@ -29,7 +29,6 @@ from terrain.classify.metrics import (
     RunFigures,
     SequenceFigures,
 )
-from terrain.classify.stiffness import StiffnessFigures
 
 MAX_ROWS = 10
 PERCENT = ".1%"
@@ -86,7 +85,6 @@ class CrossvalResult(Result):
     speed_only_accuracy: float | None = optional("accuracy from wheel speed alone", "1")
     slow_fast: SlowFast | None = optional("slow runs train and fast ones test, and the reverse")
     learning_curve: LearningCurve | None = optional("accuracy by number of training runs")
-    stiffness: StiffnessFigures | None = optional("accuracy by level of stiffness")
     filtered_accuracy: float | None = optional("accuracy of the filter over time", "1")
     filtered_accuracy_ci: tuple[float, float] | None = optional("interval of it", "1")
     filter_delay_s: DelayFigures | None = optional("from a change of terrain to its report", "s")
@@ -144,7 +142,7 @@ class CrossvalResult(Result):
         """Return the fields that are known by name; of checks that were made, all."""
         made: tuple[str, ...] = () if self.support is None else ("supported_auc",)
         if self.learning_curve is not None:
-            made += ("speed_only_accuracy", "stiffness", "courses", "recorded_courses")
+            made += ("speed_only_accuracy", "courses", "recorded_courses")
         return dict.fromkeys(made) | super().as_json()
 
     def records(self) -> Iterable[Any]:
@@ -305,7 +303,7 @@ def _coverage(result: CrossvalResult) -> list[Part]:
 
 
 def _checks(result: CrossvalResult) -> list[Part]:
-    found, curve, levels = result.slow_fast, result.learning_curve, result.stiffness
+    found, curve = result.slow_fast, result.learning_curve
     assert found is not None
     assert curve is not None
     out = [f"{name} left out ({reason})" for name, reason in found.left_out.items()]
@@ -315,15 +313,6 @@ def _checks(result: CrossvalResult) -> list[Part]:
         ("the reverse", found.fast_to_slow, PERCENT),
         ("slow and fast runs", "; ".join([str(found.status), *out])),
     ]
-    if levels is not None:
-        rows += [
-            ("stiffness level right", levels.accuracy, PERCENT),
-            ("  95 % over runs", levels.accuracy_ci, PERCENT),
-            ("soft and hard confused", levels.soft_hard_ratio, PERCENT),
-            ("cost of confusing levels, a window", levels.cost, ".3f"),
-            ("  by the class of least expected cost", levels.least_cost, ".3f"),
-            ("  gain, 95 % over runs", levels.gain_ci, ".4f"),
-        ]
     runs, right = curve.runs_per_class, curve.accuracy
     spread = [(a, std or 0.0) for a, std in zip(right, curve.accuracy_spread, strict=True)]
     low, high = [a - std for a, std in spread], [a + std for a, std in spread]
