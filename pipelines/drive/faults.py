@@ -35,7 +35,6 @@ from terrain.control.fault_drives import (
     References,
     clean_drive,
     count_bars,
-    drawn_cases,
     drive_case,
     drive_references,
     evaluate_case,
@@ -144,6 +143,24 @@ def drive_faults(
         n_met=sum(not row.unmet for row in rows),
         drawn=tuple(of_cases(fault_figure, shown, "draw")),
     )
+
+
+def drawn_cases(rows: Sequence[FaultRow], draw: Sequence[str] = ()) -> list[FaultCase]:
+    """Return the drives that are drawn, of the first seed: of each kind that with the most unmet bars.
+
+    With faults or kinds of them to draw: theirs, for the longest time that was driven.
+    """
+    longest_s = max(row.case.duration_s for row in rows)
+    first_seed = min(row.case.seed for row in rows)
+    first = [row for row in rows if row.case.seed == first_seed]
+    if draw:
+        drawn = [row.case for row in first if {row.case.fault, row.kind} & set(draw)]
+        return [case for case in drawn if case.duration_s == longest_s]
+    worst: dict[str, FaultRow] = {}
+    for row in first:
+        if row.unmet and len(row.unmet) > len(worst[row.kind].unmet if row.kind in worst else ()):
+            worst[row.kind] = row
+    return [row.case for row in worst.values()]
 
 
 def fault_loop(robot: Robot, slips: SlipTable) -> FaultLoop:

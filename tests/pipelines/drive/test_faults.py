@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipelines.drive.drive import Settings
-from pipelines.drive.faults import bars_text, drive_faults, fault_figure, fault_loop
+from pipelines.drive.faults import bars_text, drawn_cases, drive_faults, fault_figure, fault_loop
 from pipelines.live.pilot import LivePilot
 from pipelines.report.results import as_json
 from terrain.control.drive_metrics import drive_history, stopping_distance
@@ -17,7 +17,6 @@ from terrain.control.fault_drives import (
     RATIO_ABOVE_MPS,
     FaultCase,
     Place,
-    drawn_cases,
     drive_case,
     drive_references,
     evaluate_case,
