@@ -48,23 +48,25 @@ class ResponseExtractor(FeatureExtractor):
     def fit(self, X: Windows, y: Any = None) -> ResponseExtractor:
         """Learn which wheels and responses the windows have; ``DataError`` where one of the two is missing."""
         super().fit(X, y)
-        names = self.get_feature_names_out()
-        n_wheels = len(self._wheels())
-        self.columns_ = ResponseColumns(n_wheels, len(names) - n_wheels)
+        wheels, quantities = self._responses()
+        self.columns_ = ResponseColumns(len(wheels), len(wheels) * len(quantities))
         return self
 
     def transform(self, X: Windows) -> Array:
         """Return the matrix (n_windows, n_wheels + n_responses); NaN where a window has no sample."""
-        values = self.selected(X)
-        speeds = np.stack([_channel(values, self.layout_.channels, name) for name in self._speed_names()], 1)
+        values, (wheels, quantities) = self.selected(X), self._responses()
+        rows = {
+            name: values[stream][:, i]
+            for stream, names in self.layout_.channels.items()
+            for i, name in enumerate(names)
+        }
+        speeds = np.stack([rows[f"speed_{wheel}_mps"] for wheel in wheels], axis=1)
         norm = np.linalg.norm(speeds, axis=1)
         turning = norm >= MIN_TURNING * np.median(norm, axis=1, keepdims=True)
-        mean_speeds = _mean(speeds, turning)
-        sign = np.where(mean_speeds < 0.0, -1.0, 1.0)
-        columns = [mean_speeds]
-        for quantity, unit in self._quantities():
-            names = [f"{quantity}_{wheel}_{unit}" for wheel in self._wheels()]
-            each = np.stack([_channel(values, self.layout_.channels, name) for name in names], axis=1)
+        columns = [_mean(speeds, turning)]
+        sign = np.where(columns[0] < 0.0, -1.0, 1.0)
+        for quantity, unit in quantities:
+            each = np.stack([rows[f"{quantity}_{wheel}_{unit}"] for wheel in wheels], axis=1)
             beside = each.shape[2] == turning.shape[1]
             mean = _mean(each, turning if beside else np.ones((len(each), each.shape[2]), dtype=bool))
             columns.append(mean if quantity == "current" and not (each < 0.0).any() else mean * sign)
@@ -72,39 +74,31 @@ class ResponseExtractor(FeatureExtractor):
 
     def get_feature_names_out(self, input_features: Any = None) -> Array:
         """Return the name of each column with its unit."""
-        names = [f"wheels.speed_{wheel}.mean [m/s]" for wheel in self._wheels()]
-        for quantity, _ in self._quantities():
+        wheels, quantities = self._responses()
+        names = [f"wheels.speed_{wheel}.mean [m/s]" for wheel in wheels]
+        for quantity, _ in quantities:
             stream, unit = ("wheels", "A") if quantity == "current" else ("slip", "1")
-            names += [f"{stream}.{quantity}_{wheel}.mean [{unit}]" for wheel in self._wheels()]
+            names += [f"{stream}.{quantity}_{wheel}.mean [{unit}]" for wheel in wheels]
         return np.array(names, dtype=object)
 
-    def _wheels(self) -> list[str]:
-        return [name.removeprefix("speed_").removesuffix("_mps") for name in self._speed_names()]
-
-    def _speed_names(self) -> list[str]:
-        names = self.layout_.channels.get("wheels", ())
-        speeds = [name for name in names if name.startswith("speed_") and name.endswith("_mps")]
-        if not speeds:
+    def _responses(self) -> tuple[list[str], list[tuple[str, str]]]:
+        """Return the wheels, and quantity and unit of each response that all of them have."""
+        speeds = self.layout_.channels.get("wheels", ())
+        wheels = [name[6:-4] for name in speeds if name.startswith("speed_") and name.endswith("_mps")]
+        if not wheels:
             raise DataError("responses are compared at the speeds of the wheels, and the windows have none")
-        return speeds
-
-    def _quantities(self) -> list[tuple[str, str]]:
-        """Return quantity and unit of each response that all wheels have."""
         present = {name for names in self.layout_.channels.values() for name in names}
         found = [
-            RESPONSES[name]
-            for name in RESPONSES
-            if name in self.signal_sets
-            and all(
-                f"{RESPONSES[name][0]}_{wheel}_{RESPONSES[name][1]}" in present for wheel in self._wheels()
-            )
+            (quantity, unit)
+            for name, (quantity, unit) in RESPONSES.items()
+            if name in self.signal_sets and {f"{quantity}_{wheel}_{unit}" for wheel in wheels} <= present
         ]
         if not found:
             raise DataError(
                 "the windows have no response of each wheel: a current or a slip (signal sets "
                 f"{' and '.join(RESPONSES)}) is needed beside the wheel speeds"
             )
-        return found
+        return wheels, found
 
 
 def slip_cases(measured: Sequence[RunLog], slips: Sequence[MeasuredSlip], window_s: float) -> Cases:
@@ -152,10 +146,3 @@ def _mean(values: Array, used: Array) -> Array:
     n = known.sum(axis=2)
     total = np.where(known, values, 0.0).sum(axis=2)
     return np.asarray(np.divide(total, n, out=np.full(n.shape, np.nan), where=n > 0))
-
-
-def _channel(values: Mapping[str, Array], channels: Mapping[str, tuple[str, ...]], name: str) -> Array:
-    for stream, names in channels.items():
-        if name in names:
-            return values[stream][:, names.index(name)]
-    raise DataError(f"the windows have no channel {name!r}")
