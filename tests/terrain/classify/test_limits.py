@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.svm import SVC
 
@@ -148,6 +148,7 @@ def counted(training, speed, yaw):
     return found
 
 
+@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_the_table_counts_the_runs_that_are_near(seed):
     training = windows(seed)
