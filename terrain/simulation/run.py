@@ -87,7 +87,7 @@ def simulate(
     effects : parameters of :mod:`terrain.effects` that act on this robot and its sensors, beside those of its
         description or in place of them; the commands and the log do not contain them
     options : of the plant: :func:`~terrain.simulation.plants.dynamic.run_dynamic` (gnss, controller, command_delay_s),
-        :func:`~terrain.simulation.plants.planar.run_planar` (scatter, noise, outside, heading, fixes, terrain, step_s),
+        :func:`~terrain.simulation.plants.planar.run_planar` (scatter, noise, outside, heading, fixes, terrain),
         :func:`~terrain.simulation.plants.tracks.run_tracked` (slope, yaw_rad, sensors),
         :func:`~terrain.simulation.plants.car.run_car` (controller, noise)
 

@@ -505,16 +505,14 @@ class Faults:
     """
 
     camera_lost_s: tuple[tuple[float, float], ...] = ()  # intervals (start, end) without a sample
-    gnss_lost_s: tuple[tuple[float, float], ...] = ()
     by_chance: bool = True  # dropouts and jumps of the camera at the rates of its description
 
     def __post_init__(self) -> None:
-        for name in ("camera_lost_s", "gnss_lost_s"):
-            for start_s, end_s in getattr(self, name):
-                if not start_s < end_s:
-                    raise ConfigError(
-                        f"faults: {name} has ({start_s!r}, {end_s!r}), start before end is required"
-                    )
+        for start_s, end_s in self.camera_lost_s:
+            if not start_s < end_s:
+                raise ConfigError(
+                    f"faults: camera_lost_s has ({start_s!r}, {end_s!r}), start before end is required"
+                )
 
 
 NO_FAULTS: Faults = Faults()  # nothing on purpose

@@ -492,7 +492,7 @@ class Gnss(NamedTuple):
     float_length_s: float = 5.0
 
 
-def gnss_sensor(motion: Motion, receiver: Gnss, rng: np.random.Generator, faults: Faults) -> Sensor:
+def gnss_sensor(motion: Motion, receiver: Gnss, rng: np.random.Generator) -> Sensor:
     """Return RTK positions and speeds in the world frame, with stretches of float."""
     time_s, rows = motion.at(receiver.rate_hz, receiver.latency_s)
     fixed, state = np.empty(len(rows), dtype=bool), True
@@ -502,13 +502,11 @@ def gnss_sensor(motion: Motion, receiver: Gnss, rng: np.random.Generator, faults
     std = np.where(fixed, receiver.fix_std_m, receiver.float_std_m)
     noise = std[:, None] * rng.standard_normal((len(rows), 2))
     noise = np.column_stack([noise, receiver.speed_std_mps * rng.standard_normal((len(rows), 2))])
-    kept = ~is_lost(time_s, faults.gnss_lost_s)
-    noise, std, fixed = noise[kept], std[kept], fixed[kept]
 
     def write(new: slice, rows: Array, _: Array) -> Array:
         return fixes(motion.record[rows], noise[new], std[new], fixed[new])
 
-    return Sensor(motion, GNSS_CHANNELS, (time_s[kept], rows[kept]), write)
+    return Sensor(motion, GNSS_CHANNELS, (time_s, rows), write)
 
 
 def fixes(rows: Array, noise: Array, std_m: Array | float, fixed: Array | float = 1.0) -> Array:

@@ -699,7 +699,7 @@ def run_dynamic(
         "odometry": sensing.camera_sensor(motion, built, rngs["camera"], faults),
     }
     if gnss is not None:
-        sensors["gnss"] = sensing.gnss_sensor(motion, gnss, rngs["gnss"], faults)
+        sensors["gnss"] = sensing.gnss_sensor(motion, gnss, rngs["gnss"])
     for name, sensor in sensors.items():
         sensor.stamp(name, built.effects)
 

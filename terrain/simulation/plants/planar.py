@@ -287,7 +287,9 @@ def body_numbers(robot: Robot, ground: Ground) -> Array:
     speed is that of the body's origin, without delay.
     """
     complete = robot.completed
-    motors, camera, body, sensors = complete.motors, complete.camera, complete.body, complete.sensors
+    body, camera, sensors, motors = complete.body, complete.camera, complete.sensors, complete.motors
+    parts = (robot, ground, camera, sensors, motors, body)  # yaw inertia is that of the section
+    described = {n: getattr(part, n) for part in parts for n in PLANAR_BODY.names or () if hasattr(part, n)}
     n, thrust = len(robot.wheels), np.array(ground.thrust_ratio)
     soft = np.full(N_SLIPS, ground.slip_ratio)  # slip over traction at even slips
     if thrust.size >= 4:
@@ -295,32 +297,19 @@ def body_numbers(robot: Robot, ground: Ground) -> Array:
         ratio[1:] = slip[1:] / thrust[1:]
         ratio[0] = 2.0 * ratio[1] - ratio[2]
         soft = ratio if thrust.size == N_SLIPS else np.interp(_SLIPS, slip, ratio)
-    return filled(
-        PLANAR_BODY,
-        n_wheels=n,
-        track_m=robot.track_m,
-        radius_m=robot.wheel_radius_m,
-        mass_kg=robot.mass_kg,
-        rotating_kg=n * body.wheel_inertia_kgm2 / robot.wheel_radius_m**2,
-        yaw_inertia_kgm2=body.yaw_inertia_kgm2,
-        nm_per_a=motors.nm_per_a,
-        friction_nm=n * motors.friction_nm,
-        lever_x_m=camera.lever_x_m,
-        lever_y_m=camera.lever_y_m,
-        latency_s=camera.latency_s + camera.time_constant_s,
-        imu_latency_s=sensors.imu_latency_s,
-        imu_lag_s=IMU_LAG_S if isinstance(robot, SwerveRobot) else 0.0,
-        encoder_lag_s=sensors.encoder_time_constant_s,
-        com_x_m=body.com_x_m,
-        com_y_m=body.com_y_m,
-        soft_ratio=soft,
-        grip_ratio=ground.grip_ratio,
-        rolling_ratio=ground.rolling_ratio,
-        scrub_ratio=ground.scrub_ratio if robot.skids else 0.0,
-        load_ratio=ground.load_ratio,
-        effective_ratio=ground.effective_ratio,
-        seen_from_above=robot.on_omni_wheels,
-    )
+    described |= {
+        "n_wheels": n,
+        "radius_m": robot.wheel_radius_m,
+        "rotating_kg": n * body.wheel_inertia_kgm2 / robot.wheel_radius_m**2,
+        "friction_nm": n * motors.friction_nm,
+        "latency_s": camera.latency_s + camera.time_constant_s,
+        "imu_lag_s": IMU_LAG_S if isinstance(robot, SwerveRobot) else 0.0,
+        "encoder_lag_s": sensors.encoder_time_constant_s,
+        "soft_ratio": soft,
+        "scrub_ratio": ground.scrub_ratio if robot.skids else 0.0,
+        "seen_from_above": robot.on_omni_wheels,
+    }
+    return filled(PLANAR_BODY, **described)
 
 
 @njit
@@ -1309,7 +1298,6 @@ def run_planar(
     heading: bool = False,
     fixes: bool = False,
     terrain: str = "",
-    step_s: float = STEP_S,
 ) -> tuple[dict[str, Stream], tuple[Label, ...]]:
     """Return streams and labels of a drive, for :func:`terrain.simulation.run.simulate`, which describes the rest.
 
@@ -1325,9 +1313,8 @@ def run_planar(
     heading : add the stream lidar, with the rate of a heading that does not depend on the gyro
     fixes : add the streams gnss and compass
     terrain : label of a drive that is no scenario; without one it has none
-    step_s : from step to step
     """
-    outside, dt = outside or {}, step_s
+    outside, dt = outside or {}, STEP_S
     twist = drive.twist if isinstance(drive, Scenario) else np.asarray(drive)
     terrain = drive.patches[0].terrain if isinstance(drive, Scenario) else terrain
     if isinstance(robot, SwerveRobot):
@@ -1345,9 +1332,6 @@ def run_planar(
             raise ConfigError(
                 f"outside: {name} is {value!r}; finite numbers of {', '.join(OUTSIDE)} are required"
             )
-    parts = STEP_S / dt if dt > 0 else 0.0
-    if parts < 0.5 or abs(parts - round(parts)) > 1e-9:
-        raise ConfigError(f"step_s is {dt:g}, {STEP_S:g} s or a whole part of it is required")
     logs_currents = robot.describes("motors") and "motors" in robot.sections
     robot, rngs = with_silent_parts(robot), sensing.generators(seed, _PURPOSES)
     camera, sensors, motors, wheels = robot.camera, robot.sensors, robot.motors, len(robot.wheels)

@@ -191,36 +191,34 @@ def tracks_on(
     >>> tracks_on(load_robot("patako"), load_soil("dry_sand"))["half_m"].round(4)
     array([0.1965])
     """
-    across_m = robot.track_m + robot.track_width_m
-    of_robot = {
+    across_m, names = robot.track_m + robot.track_width_m, TRACKS.names or ()
+    described = {n: getattr(part, n) for part in (robot, ground) for n in names if hasattr(part, n)} | {
         "half_m": robot.half_track_m,
         "length_m": robot.contact_length_m,
         "width_m": robot.track_width_m,
         "height_m": robot.com_height_m,
-        "mass_kg": robot.mass_kg,
         "inertia_kgm2": robot.mass_kg * (robot.contact_length_m**2 + across_m**2) / 12.0,
         "area_m2": robot.contact_length_m * robot.track_width_m,
         "until_m": until_m,
     }
     if isinstance(ground, PrescribedSlip):
-        return filled(TRACKS, **of_robot, **ground._asdict())
+        return filled(TRACKS, **described)
     if ground.law != "janosi":
         raise ConfigError(
             f"soil {ground.name!r} has the law {ground.law!r}: a tracked robot is simulated on ground that "
             "shears, the law 'janosi'"
         )
-    of_soil = {
+    described |= {
         "sheared": True,
-        "cohesion_pa": ground.cohesion_pa,
         "tan_friction": math.tan(ground.friction_angle_rad),
-        "shear_modulus_m": ground.shear_modulus_m,
         "rolling_ratio": ground.rolling_resistance_ratio,
         "passive_ratio": math.tan(math.pi / 4 + ground.friction_angle_rad / 2) ** 2,
+        "exponent_ratio": ground.sinkage_exponent_ratio,
+        "bulldozing_ratio": bulldozing_ratio,
     }
-    if math.isfinite(ground.kphi_npmn2):
-        of_soil |= {"kc_npmn1": ground.kc_npmn1, "kphi_npmn2": ground.kphi_npmn2}
-        of_soil |= {"exponent_ratio": ground.sinkage_exponent_ratio, "bulldozing_ratio": bulldozing_ratio}
-    return filled(TRACKS, **of_robot, **of_soil)
+    if not math.isfinite(ground.kphi_npmn2):  # no rut is pressed, and nothing pushed aside
+        described |= dict.fromkeys(("kc_npmn1", "kphi_npmn2", "exponent_ratio", "bulldozing_ratio"), 0.0)
+    return filled(TRACKS, **described)
 
 
 @njit

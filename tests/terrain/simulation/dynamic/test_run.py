@@ -97,11 +97,7 @@ def test_labels_cover_stretches_with_all_wheels_on_one_terrain():
     assert all(
         start > end + 0.9 for start, end in zip(starts[1:], ends[:-1], strict=True)
     )  # 1.015 m at 1 m/s
-
-
-def test_a_ground_that_is_crossed_in_a_moment_gets_no_label():
-    time_s = np.arange(501) / 50
-    twist = np.column_stack([np.minimum(time_s, 1.0), np.zeros((501, 2))])
+    # a ground that is crossed in a moment gets none
     drive = Scenario("mine", 50.0, time_s, twist, ((0.0, "tiles"), (3.0, "asphalt"), (4.3, "snow")))
     assert simulate(ROBOT, drive, SOILS, 1).terrains == ("tiles", "snow")
 
@@ -200,7 +196,7 @@ def kinematic(sample):
         (
             "complex",
             "grass",
-            {"conditions": HILLY, "gnss": Gnss(rate_hz=7.0), "faults": Faults(gnss_lost_s=((3.0, 5.0),))},
+            {"conditions": HILLY, "gnss": Gnss(rate_hz=7.0)},
         ),
         ("straight", "tiles", {"faults": Faults(camera_lost_s=((2.0, 3.51), (4.0, 4.001)))}),
         ("course", ["tiles", "snow", "grass"], {"duration_s": 25.0}),
@@ -254,24 +250,11 @@ def test_a_command_is_in_force_from_its_delay_to_that_of_the_next(delay, monkeyp
         return STAND._replace(wheel_radps=next(rows))
 
     monkeypatch.setattr(dynamic, "advance", noted)
-    run_of(drive, "clay", controller=controller, command_delay_s=delay / 1000)
+    run = run_of(drive, "clay", controller=controller, command_delay_s=delay / 1000)
     given = np.concatenate(given)[-20 * len(wheel) :]  # the robot was settled before
+    np.testing.assert_array_equal(run.streams["commands"].values[:, 3:6], wheel)  # as decided, not as delayed
     tick = (np.arange(len(given)) - max(delay, 1)) // 20
     np.testing.assert_array_equal(given, np.where(tick[:, None] >= 0, wheel[tick], 0.0))
-
-
-@pytest.mark.parametrize("delay_s", [0, np.float64(0.123), 0.5])
-def test_wheels_stand_until_the_first_command_arrives(delay_s):
-    def at_once(sample):
-        return STAND._replace(wheel_radps=np.full(3, 3.0), steer_rad=np.full(3, 0.2))
-
-    run = run_of("stand", "tiles", controller=at_once, duration_s=2.0, command_delay_s=delay_s)
-    truth = run.streams["truth"]
-    turning = truth.time_s[np.abs(wheels_of(truth, "wheel_{}_radps")).max(axis=1) > 0]
-    assert delay_s < turning[0] <= delay_s + 0.02
-    assert (run.streams["commands"].values[:, 3:6] == 3.0).all()  # as decided, not as delayed
-    np.testing.assert_allclose(wheels_of(truth, "wheel_{}_radps")[-1], 3.0, atol=0.1)
-    np.testing.assert_allclose(wheels_of(truth, "steer_{}_rad")[-1], 0.2, atol=0.025)
 
 
 @pytest.mark.parametrize(

@@ -7,16 +7,7 @@ import numpy as np
 import pytest
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects import (
-    ACCEL,
-    CHANNELS,
-    CURRENT,
-    GYRO,
-    SPEED_X,
-    SPEED_Y,
-    TURNING_CURRENT,
-    vector_of,
-)
+from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, SPEED_X, SPEED_Y, TURNING_CURRENT, vector_of
 from terrain.kinematics.commands import inverse
 from terrain.robots import load_robot
 from terrain.simulation.plants.dynamic import DEFLECTION_DAMPING_S, shear_slip
