@@ -42,48 +42,45 @@ def driven(scenario, soil, grade, effects=()):
 
 def truth(run, channel, time_s):
     stream = run.streams["truth"]
-    return np.interp(time_s, stream.time_s, np.nan_to_num(stream.channel(channel)))
+    return np.interp(time_s, stream.time_s, np.unwrap(np.nan_to_num(stream.channel(channel))))
 
 
-def steady(run, name, start_s=6.0):
+def mean(run, name, channels, start_s=6.0, end_s=math.inf):
+    """Return the means (c,) of channels, or of all three wheels by a pattern, over a time."""
     stream = run.streams[name]
-    return stream, stream.time_s > start_s
-
-
-def summed(run, pattern, start_s=6.0):
-    stream, late = steady(run, "wheels" if pattern.startswith("current") else "truth", start_s)
-    return float(sum(stream.channel(pattern.format(i))[late].mean() for i in (1, 2, 3)))
+    names = [channels.format(i) for i in (1, 2, 3)] if "{}" in channels else [channels]
+    inside = (stream.time_s > start_s) & (stream.time_s < end_s)
+    return np.array([stream.channel(name)[inside].mean() for name in names])
 
 
 def slope(x, y):
     return float(np.polyfit(x, y, 1)[0])
 
 
+def seen(run, robot, time_s=None):
+    """Return time, speeds (n, 2) and yaw rate that the camera shows of the robot, at times or at its own."""
+    camera = run.streams["odometry"]
+    motion, at_s = body_motion(camera, robot.camera), camera.time_s if time_s is None else time_s
+    return at_s, *(np.interp(at_s, camera.time_s, v) for v in (*motion.speed_mps.T, motion.yaw_rate_radps))
+
+
 def rolling(run, robot):
     wheels = run.streams["wheels"]
     rates = np.column_stack([wheels.channel(f"motor_{i}_radps") for i in (1, 2, 3)])
     wheel_speed = rates.mean(axis=1) / robot.motors.reduction_ratio * robot.wheel_radius_m
-    camera = run.streams["odometry"]
-    seen = body_motion(camera, robot.camera).speed_mps[:, 0]
-    return slope(wheel_speed, np.interp(wheels.time_s, camera.time_s, seen))
+    return slope(wheel_speed, seen(run, robot, wheels.time_s)[1])
 
 
 def twist_error(component):
     """What camera and gyro say beyond the twist that wheels and steering ask for."""
 
     def feature(run, robot):
-        wheels, late = steady(run, "wheels")
-        rates = np.column_stack([wheels.channel(f"motor_{i}_radps")[late] for i in (1, 2, 3)])
-        angles = run.streams["steering"]
-        zeros = [getattr(robot.steering, f"zero_{i}_rad") for i in (1, 2, 3)]
-        late = angles.time_s > 6.0
-        steer = np.column_stack([angles.channel(f"angle_{i}_rad")[late] for i in (1, 2, 3)]) - zeros
-        rate = rates.mean(axis=0) / robot.motors.reduction_ratio
-        twist, _ = no_slip_twist(robot.wheel_positions_m, steer.mean(axis=0), robot.wheel_radius_m * rate)
-        imu, late = steady(run, "imu")
-        turn = imu.channel("gyro_z_radps")[late].mean()
-        camera, late = steady(run, "odometry")
-        v_x, v_y = body_motion(camera, robot.camera).speed_mps[late].mean(axis=0)
+        rate = mean(run, "wheels", "motor_{}_radps") / robot.motors.reduction_ratio
+        steer = mean(run, "steering", "angle_{}_rad") - robot.steering_zeros_rad
+        twist, _ = no_slip_twist(robot.wheel_positions_m, steer, robot.wheel_radius_m * rate)
+        (turn,) = mean(run, "imu", "gyro_z_radps")
+        time_s, *speeds, _ = seen(run, robot)
+        v_x, v_y = (speed[time_s > 6.0].mean() for speed in speeds)
         measured = (v_x + turn * robot.camera.lever_y_m, v_y - turn * robot.camera.lever_x_m, turn)
         return measured[component] - twist[component]
 
@@ -92,91 +89,58 @@ def twist_error(component):
 
 def asked(radii=(1.0, 1.0, 1.0), steer=(0.0, 0.0, 0.0), component=2):
     """Change of the twist of wheels that are commanded straight ahead at 1 m/s."""
-    rate = np.array(radii) / ROBOT.wheel_radius_m
-    return float(
-        no_slip_twist(ROBOT.wheel_positions_m, np.array(steer), ROBOT.wheel_radius_m * rate)[0][component]
-    )
+    twist, _ = no_slip_twist(ROBOT.wheel_positions_m, np.array(steer), np.array(radii))
+    return float(twist[component])
 
 
-def encoder_error(run, robot):
-    steering = run.streams["steering"]
-    seen = np.unwrap(steering.channel("angle_2_rad"))
-    rate = np.gradient(seen, steering.time_s)
-    error = seen - truth_angle(run, steering.time_s)
-    turning = np.abs(rate) > 0.3
-    return error[turning], rate[turning]
+def steering_error(feature):
+    """Error of an encoder where it turns, beside its rate."""
+
+    def of_run(run, robot):
+        steering = run.streams["steering"]
+        angle = np.unwrap(steering.channel("angle_2_rad"))
+        rate = np.gradient(angle, steering.time_s)
+        turning = np.abs(rate) > 0.3
+        return float(feature((angle - truth(run, "steer_2_rad", steering.time_s))[turning], rate[turning]))
+
+    return of_run
 
 
-def truth_angle(run, time_s):
-    stream = run.streams["truth"]
-    return np.interp(time_s, stream.time_s, np.unwrap(stream.channel("steer_2_rad")))
-
-
-def play(run, robot):
-    error, rate = encoder_error(run, robot)
-    return float(np.median(error * np.sign(rate)))
-
-
-def steering_late(run, robot):
-    error, rate = encoder_error(run, robot)
-    return slope(rate, error)
-
-
-def standing(channel):
+def standing(stream, channels, bias=""):
     def feature(run, robot):
-        imu = run.streams["imu"]
-        value = float(imu.channel(channel)[imu.time_s < 0.9].mean())
-        bias = {"gyro_z_radps": "gyro_bias_z_radps", "accel_x_mps2": "accel_bias_x_mps2"}[channel]
-        return value - getattr(robot.sensors, bias)
+        value = mean(run, stream, channels, -1.0, 0.9).sum()
+        return float(value - (getattr(robot.sensors, bias) if bias else 0.0))
 
     return feature
 
 
+def late(true, measured, latency_s):
+    """By how much a signal is behind the truth, from its error over the truth's rate."""
+
+    def feature(run, robot):
+        time_s, values = measured(run, robot)
+        time_s = time_s - latency_s(robot)
+        there = truth(run, true, time_s)
+        return -slope(np.gradient(there, time_s), values - there)
+
+    return feature
+
+
+def gyro(run, robot):
+    return run.streams["imu"].time_s, run.streams["imu"].channel("gyro_z_radps")
+
+
 def gyro_slope(run, robot):
     imu, camera = run.streams["imu"], run.streams["odometry"]
-    seen = np.interp(imu.time_s, camera.time_s, camera.channel("rate_y_radps"))
-    return slope(seen, imu.channel("gyro_z_radps"))
-
-
-def fused_yaw(run, robot):
-    imu = run.streams["imu"]
-    return slope(truth(run, "yaw_rad", imu.time_s), np.unwrap(imu.channel("yaw_rad")))
-
-
-def camera_late(run, robot):
-    camera = run.streams["odometry"]
-    time_s = camera.time_s - robot.camera.latency_s
-    speed = body_motion(camera, robot.camera).speed_mps[:, 0]
-    true = truth(run, "speed_x_mps", time_s)
-    return -slope(np.gradient(true, time_s), speed - true)
-
-
-def gyro_late(run, robot):
-    imu = run.streams["imu"]
-    true = truth(run, "yaw_rate_radps", imu.time_s)
-    return -slope(np.gradient(true, imu.time_s), imu.channel("gyro_z_radps") - true)
-
-
-def imu_late(run, robot):
-    imu = run.streams["imu"]
-    true = truth(run, "yaw_rate_radps", imu.time_s - robot.sensors.imu_latency_s)
-    return -slope(np.gradient(true, imu.time_s), imu.channel("gyro_z_radps") - true)
-
-
-def standing_current(run, robot):
-    wheels = run.streams["wheels"]
-    stands = wheels.time_s < 0.9
-    return float(sum(wheels.channel(f"current_{i}_a")[stands].mean() for i in (1, 2, 3)))
+    return slope(np.interp(imu.time_s, camera.time_s, camera.channel("rate_y_radps")), gyro(run, robot)[1])
 
 
 def counted(i):
     """Measured over true rate of a wheel."""
 
     def feature(run, robot):
-        wheels, late = steady(run, "wheels")
-        true = truth(run, f"wheel_{i}_radps", wheels.time_s[late])
-        measured = wheels.channel(f"motor_{i}_radps")[late] / robot.motors.reduction_ratio
-        return slope(true, measured) if np.ptp(true) > 1.0 else float(measured.mean() / true.mean())
+        measured = mean(run, "wheels", f"motor_{i}_radps") / robot.motors.reduction_ratio
+        return float(measured[0] / mean(run, "truth", f"wheel_{i}_radps")[0])
 
     return feature
 
@@ -192,49 +156,44 @@ def encoder_late(run, robot):
 
 
 def sideways(run, robot):
-    camera, late = steady(run, "odometry")
-    v_x, v_y = body_motion(camera, robot.camera).speed_mps[late].T
-    return float(np.mean(v_y) / np.mean(v_x))
+    time_s, v_x, v_y, _ = seen(run, robot)
+    return float(v_y[time_s > 6.0].mean() / v_x[time_s > 6.0].mean())
 
 
-def lever(component):
-    def feature(run, robot):
-        camera = run.streams["odometry"]
-        seen = body_motion(camera, robot.camera)
-        arm = (robot.camera.lever_x_m, -robot.camera.lever_y_m)[component]
-        speed = seen.speed_mps[:, 1 - component] - arm * seen.yaw_rate_radps
-        return slope(seen.yaw_rate_radps, speed)
-
-    return feature
-
-
-def imu_length(run, robot):
-    return run.streams["imu"].duration_s
+def lever(run, robot):
+    _, _, v_y, turn = seen(run, robot)
+    return slope(turn, v_y - robot.camera.lever_x_m * turn)
 
 
 def slips(run, robot):
-    return summed(run, "slip_{}_ratio") / 3
+    return mean(run, "truth", "slip_{}_ratio").mean()
 
 
 def traction(run, robot):
-    return summed(run, "traction_{}_n") / WEIGHT_N
+    return mean(run, "truth", "traction_{}_n").sum() / WEIGHT_N
 
 
 def current(run, robot):
     """Current over what moves the robot as described."""
-    per_n = robot.wheel_radius_m / (
-        robot.motors.torque_constant_nmpa * robot.motors.reduction_ratio * robot.motors.efficiency_ratio
-    )
-    return summed(run, "current_{}_a") / (summed(run, "traction_{}_n") * per_n)
+    moved_nm = traction(run, robot) * WEIGHT_N * robot.wheel_radius_m
+    return mean(run, "wheels", "current_{}_a").sum() * robot.motors.nm_per_a / moved_nm
 
 
 def warming(run, robot):
-    return summed(run, "current_{}_a", 14.0) / summed(run, "current_{}_a", 6.0)
+    return mean(run, "wheels", "current_{}_a", 14.0).sum() / mean(run, "wheels", "current_{}_a").sum()
 
 
 LEVEL, UPHILL, STEEP, ACROSS = (0.0, 0.0), (0.1, 0.0), (0.3, 0.0), (0.0, 0.15)
-_FORCE = 0.1 / math.hypot(1.0, 0.1)
 E = 0.06
+PLAY = steering_error(lambda error, rate: np.median(error * np.sign(rate)))
+STEERING_LATE = steering_error(lambda error, rate: slope(rate, error))
+GYRO_STANDING = standing("imu", "gyro_z_radps", "gyro_bias_z_radps")
+ACCEL_STANDING = standing("imu", "accel_x_mps2", "accel_bias_x_mps2")
+CURRENT_STANDING = standing("wheels", "current_{}_a")
+GYRO_LATE = late("yaw_rate_radps", gyro, lambda robot: 0.0)
+IMU_LATE = late("yaw_rate_radps", gyro, lambda robot: robot.sensors.imu_latency_s)
+CAMERA_LATE = late("speed_x_mps", lambda *run: seen(*run)[:2], lambda robot: robot.camera.latency_s)
+IMU_LENGTH = lambda run, robot: run.streams["imu"].duration_s  # noqa: E731
 CASES = {
     # effect: values, scenario, soil, slope, feature, its change by the values, whether it can be corrected
     "wheel_radius": ((E,), "starts", "tiles", LEVEL, rolling, E, True),
@@ -253,17 +212,17 @@ CASES = {
         )
         for i, component in ((1, 2), (2, 2), (3, 1))
     },
-    "steering_backlash": ((0.04,), "complex", "grass", LEVEL, play, 0.04, True),
-    "steering_delay": ((0.08,), "complex", "grass", LEVEL, steering_late, 0.08, True),
-    "gyro_bias": ((0.03,), "straight", "grass", LEVEL, standing("gyro_z_radps"), 0.03, True),
+    "steering_backlash": ((0.04,), "complex", "grass", LEVEL, PLAY, 0.04, True),
+    "steering_delay": ((0.08,), "complex", "grass", LEVEL, STEERING_LATE, 0.08, True),
+    "gyro_bias": ((0.03,), "straight", "grass", LEVEL, GYRO_STANDING, 0.03, True),
     "gyro_scale": ((-0.05,), "spot_turn", "tiles", LEVEL, gyro_slope, -0.05, True),
-    "accel_bias": ((0.3,), "straight", "grass", LEVEL, standing("accel_x_mps2"), 0.3, True),
-    "imu_latency": ((0.06,), "complex", "grass", LEVEL, imu_late, 0.06, True),
-    "camera_latency": ((0.06,), "starts", "grass", LEVEL, camera_late, 0.06, True),
+    "accel_bias": ((0.3,), "straight", "grass", LEVEL, ACCEL_STANDING, 0.3, True),
+    "imu_latency": ((0.06,), "complex", "grass", LEVEL, IMU_LATE, 0.06, True),
+    "camera_latency": ((0.06,), "starts", "grass", LEVEL, CAMERA_LATE, 0.06, True),
     "camera_yaw": ((0.05,), "straight", "tiles", LEVEL, sideways, 0.05, True),
-    "lever_arm": ((0.1, -0.07), "spot_turn", "tiles", LEVEL, lever(0), 0.1, True),
-    "clock_offset": ((0.05,), "complex", "grass", LEVEL, gyro_late, 0.05, True),
-    "clock_rate": ((0.002,), "complex", "grass", LEVEL, imu_length, 0.002 * 39.99, True),
+    "lever_arm": ((0.1, -0.07), "spot_turn", "tiles", LEVEL, lever, 0.1, True),
+    "clock_offset": ((0.05,), "complex", "grass", LEVEL, GYRO_LATE, 0.05, True),
+    "clock_rate": ((0.002,), "complex", "grass", LEVEL, IMU_LENGTH, 0.002 * 39.99, True),
     "encoder_lag": ((0.04,), "starts", "grass", LEVEL, encoder_late, 0.04, True),
     "force_slip": ((0.4,), "straight", "grass", UPHILL, slips, None, False),
     "shear_slip": ((0.4,), "straight", "tiles", STEEP, slips, None, False),
@@ -272,7 +231,7 @@ CASES = {
     "viscous_drag": ((40.0,), "straight", "tiles", LEVEL, traction, 40.0 / WEIGHT_N, False),
     "payload": ((0.3,), "straight", "tiles", UPHILL, traction, None, False),
     "motor_constant": ((0.2,), "straight", "tiles", UPHILL, current, None, True),
-    "current_offset": ((0.4,), "straight", "tiles", LEVEL, standing_current, 3 * 0.4, True),
+    "current_offset": ((0.4,), "straight", "tiles", LEVEL, CURRENT_STANDING, 3 * 0.4, True),
     "motor_drift": ((0.5,), "straight", "tiles", UPHILL, warming, None, True),
     "side_hill_slip": ((0.3,), "straight", "tiles", ACROSS, sideways, -0.3 * math.atan(0.15), False),
 }
