@@ -124,6 +124,7 @@ class Inverse(NamedTuple):
     columns: tuple[str, ...] = ()  #: beginnings of the channels that change, or STAMPS
     combine: Combine = Combine.ADDED  #: how the corrected number follows from the measured one
     without_home: bool = False  #: only where the description lacks the section of the parameter's home
+    drifts: bool = False  #: whether the value grows from 0 with the time since the start, by itself a minute
     #: of what takes more than one number a sample; two parameters may share one
     undo: Callable[[Block, float], None] | None = None
     act: Callable[[Block, float], None] | None = None
@@ -132,6 +133,10 @@ class Inverse(NamedTuple):
     def is_factor(self) -> bool:
         """Whether numbers are multiplied."""
         return self.combine in (Combine.TIMES, Combine.OVER)
+
+    def size(self, value: float, since_start_s: Array) -> Any:
+        """Return the value at times (k,) since the start."""
+        return value * since_start_s / 60.0 if self.drifts else value
 
 
 class Parameter(NamedTuple):
@@ -345,22 +350,6 @@ def _undo_one_sided_radius(block: Block, e: float) -> None:
         wheel = rest.rpartition("_")[0]
         if quantity in ("motor", "speed", "wheel") and wheel in block.robot.wheels:
             block.values[:, i] *= 1.0 + (0.5 if wheel in ("3", "right") else -0.5) * e
-
-
-def _warm(block: Block, e: float) -> tuple[list[int], Array]:
-    """Return the columns of currents, and their factor (k, 1)."""
-    currents = [i for i, name in enumerate(block.channels) if name.startswith("current_")]
-    return currents, 1.0 + e * (block.time_s - block.start_s)[:, None] / 60.0
-
-
-def _act_motor_drift(block: Block, e: float) -> None:
-    currents, factor = _warm(block, e)
-    block.values[:, currents] *= factor
-
-
-def _undo_motor_drift(block: Block, e: float) -> None:
-    currents, factor = _warm(block, e)
-    block.values[:, currents] /= factor
 
 
 def _undo_yaw_delay(block: Block, delay_s: float) -> None:
@@ -842,7 +831,7 @@ LIBRARY: tuple[Effect, ...] = (
         BOTH,
         (CURRENT, TURNING_CURRENT),
         "long runs",
-        inverse=Inverse(("wheels",), combine=Combine.OVER, undo=_undo_motor_drift, act=_act_motor_drift),
+        inverse=Inverse(("wheels",), ("current_",), Combine.OVER, drifts=True),
     ),
     # current of each motor + b: n b in the sum of n motors, nothing in the difference of the sides (zero
     # error of a current sensor)
@@ -1058,12 +1047,12 @@ def showing(drive: str, known: Collection[str] = ()) -> tuple[Effect, ...]:
     >>> showing("omni", ["roller_friction_ratio"]) == library_of("omni")
     True
     """
-
-    def shows(effect: Effect) -> bool:
-        others = [effect_named(name) for of, name in effect.beside if of == drive]
-        return all(any(p.name in known for p in other.parameters) for other in others)
-
-    return tuple(effect for effect in library_of(drive) if shows(effect))
+    shown = []
+    for effect in library_of(drive):
+        beside = [effect_named(name).parameters for of, name in effect.beside if of == drive]
+        if all(any(p.name in known for p in parameters) for parameters in beside):
+            shown.append(effect)
+    return tuple(shown)
 
 
 def parameters_of(drive: str) -> dict[str, Parameter]:
@@ -1126,7 +1115,7 @@ def on_samples(
                 inverse.act(Block(stream, channels, time_s, values, 0.0, None, None, {}), e)
             for i, channel in enumerate(channels):
                 if inverse.columns and channel.startswith(inverse.columns):
-                    values[:, i] = inverse.combine.invert(values[:, i], e)
+                    values[:, i] = inverse.combine.invert(values[:, i], inverse.size(e, time_s))
         return stamps, values
 
     return change

@@ -30,8 +30,6 @@ from terrain.effects import (
     SCHEMA,
     STAMPS,
     Block,
-    Home,
-    Parameter,
     checked_covariance,
     checked_effects,
     parameters_of,
@@ -59,10 +57,15 @@ def apply_homes(robot: AnyRobot, names: Collection[str] = tuple(PARAMETER)) -> A
     applied = []
     for name, value in robot.effects.items():
         homes = PARAMETER[name].homes
-        if name in names and homes and all(home.optional or _has_section(robot, home) for home in homes):
-            for home in homes:
-                robot = _apply(robot, home, value)
-            applied.append(name)
+        there = [home for home in homes if not home.section or robot.describes(home.section)]
+        if name not in names or not there or not all(home.optional for home in homes if home not in there):
+            continue
+        for home in there:
+            part: Any = robot.parts[home.section] if home.section else robot
+            change = value * getattr(part, home.scaled_by) if home.scaled_by else value
+            part = replace(part, **{home.field: home.combine.apply(getattr(part, home.field), change)})
+            robot = robot.with_parts(**{home.section: part}) if home.section else part
+        applied.append(name)
     return _without(robot, applied)
 
 
@@ -102,22 +105,6 @@ def check_corrected(robot: Robot) -> None:
         raise ConfigError(
             f"robot {robot.name}: {', '.join(sorted(left))} is not corrected, neither in it nor in its log"
         )
-
-
-def _has_section(robot: Robot, home: Home) -> bool:
-    return not home.section or robot.describes(home.section)
-
-
-def _apply(robot: AnyRobot, home: Home, value: float) -> AnyRobot:
-    """Return a robot with one number of its description changed; the same robot if it lacks the section."""
-    if not _has_section(robot, home):
-        return robot
-    part: Any = robot.parts[home.section] if home.section else robot
-    if home.scaled_by:
-        value *= getattr(part, home.scaled_by)
-    part = replace(part, **{home.field: home.combine.apply(getattr(part, home.field), value)})
-    changed: AnyRobot = robot.with_parts(**{home.section: part}) if home.section else part
-    return changed
 
 
 def _without(robot: AnyRobot, names: Collection[str]) -> AnyRobot:
@@ -341,7 +328,8 @@ class Correction:
                 elif inverse.undo is None:
                     for i, channel in enumerate(channels):
                         if inverse.columns and channel.startswith(inverse.columns):
-                            values[:, i] = inverse.combine.apply(values[:, i], value)
+                            size = inverse.size(value, time_s - self._start_s)
+                            values[:, i] = inverse.combine.apply(values[:, i], size)
                 elif inverse.undo not in done:
                     inverse.undo(block, value)
                     done.add(inverse.undo)
@@ -461,8 +449,25 @@ def extended_yaml(
         raise ConfigError(
             f"effects: covariance has the shape {cov.shape}, {(len(names), len(names))} is required"
         )
-    lines = _section_lines(values, parameters_of(robot.drive), cov, intervals, source)
-    lines += [] if region is None else _region_lines(region)
+    known, section = parameters_of(robot.drive), {"schema": str(SCHEMA)}
+    for name, value in values.items():
+        low, high = [float(edge) for edge in intervals.get(name, (math.nan, math.nan))]
+        if not low <= value <= high < math.inf:
+            raise ConfigError(f"effects: {name} is {value:g}, its interval {low:g} to {high:g} must hold it")
+        entry: dict[str, Any] = {"value": _rounded(value), "unit": known[name].unit, "source": source}
+        section[name] = _flow(entry | {"interval": [_rounded(low), _rounded(high)]})
+    lines = ["effects:", *[f"  {name}: {entry}" for name, entry in section.items()]]
+    lines.append("  covariance:" if names else "  covariance: {}")
+    for name, row in zip(names, cov, strict=True):
+        lines.append(f"    {name}: {_flow(dict(zip(names, map(_rounded, row), strict=True)))}")
+    if region is not None:  # a range that was not measured has no line
+        ranges = {
+            name: [*map(_rounded, pair)]
+            for name, pair in zip(region._fields, region[:3], strict=False)
+            if pair
+        }
+        lines.append("  region:")
+        lines += [f"    {n}: {_flow(e)}" for n, e in {**ranges, "terrains": [*region.terrains]}.items()]
     text = _without_effects(path.read_text(encoding="utf-8-sig")) + "\n".join(lines) + "\n"
     try:
         content = parse_yaml(text)
@@ -473,38 +478,6 @@ def extended_yaml(
         raise ConfigError(f"{path}: cannot be extended as it is written: one section a line is required")
     robot_from(path.name, content)
     return text
-
-
-def _section_lines(
-    values: Mapping[str, float],
-    known: Mapping[str, Parameter],
-    cov: Array,
-    intervals: Mapping[str, tuple[float, float]],
-    source: str,
-) -> list[str]:
-    """Return the lines of the section ``effects``."""
-    section: dict[str, Any] = {"schema": SCHEMA}
-    for name, value in values.items():
-        low, high = (float(edge) for edge in intervals.get(name, (math.nan, math.nan)))
-        if not low <= value <= high < math.inf:
-            raise ConfigError(f"effects: {name} is {value:g}, its interval {low:g} to {high:g} must hold it")
-        section[name] = {"value": _rounded(value), "unit": known[name].unit, "source": source}
-        section[name]["interval"] = [_rounded(low), _rounded(high)]
-    rows = [dict(zip(values, map(_rounded, row), strict=True)) for row in cov]
-    lines = ["effects:", *(f"  {name}: {_flow(entry)}" for name, entry in section.items())]
-    lines += ["  covariance:" if rows else "  covariance: {}"]
-    return lines + [f"    {name}: {_flow(row)}" for name, row in zip(values, rows, strict=True)]
-
-
-def _region_lines(region: Region) -> list[str]:
-    """Return the lines of the region; a range that was not measured has none."""
-    ranges = {
-        name: [_rounded(edge) for edge in pair]
-        for name, pair in zip(region._fields, region[:3], strict=False)
-        if pair
-    }
-    entries: dict[str, Any] = {**ranges, "terrains": list(region.terrains)}
-    return ["  region:", *(f"    {name}: {_flow(entry)}" for name, entry in entries.items())]
 
 
 def _without_effects(text: str) -> str:
