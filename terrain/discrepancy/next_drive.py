@@ -17,7 +17,7 @@ from itertools import combinations
 
 import numpy as np
 
-from terrain import effects
+from terrain.discrepancy import runs
 from terrain.discrepancy.evidence import (
     EXCITED_RATIO,
     Z_EFFECT,
@@ -28,18 +28,9 @@ from terrain.discrepancy.evidence import (
 )
 from terrain.discrepancy.noise import ORDER, Noise
 from terrain.discrepancy.robot_terms import listed
-from terrain.discrepancy.runs import (
-    PARALLEL,
-    Signals,
-    Simulation,
-    TerrainMatch,
-    drivable,
-    low_pass_of,
-    measured_channels,
-)
 from terrain.discrepancy.search import names_of
 from terrain.discrepancy.verdict import Limit, NextDrive
-from terrain.effects import BOUNDS, CHANNELS, effect_named
+from terrain.effects import BOUNDS, CHANNELS, CURRENT, effect_named
 from terrain.errors import ConfigError
 from terrain.kinematics.commands import wheel_motion
 from terrain.records import Array
@@ -72,19 +63,15 @@ MOST = {name: max(abs(low), abs(high)) for name, (low, high) in BOUNDS.items()}
 
 
 def next_drive(
-    simulation: Simulation,
-    sets: Sequence[tuple[str, ...]],
-    missed: Sequence[Limit],
-    info: Evidence | None = None,
+    simulation: runs.Simulation, sets: Sequence[tuple[str, ...]], missed: Sequence[Limit], info: Evidence
 ) -> NextDrive | None:
     """Return the next drive, None where nothing is to be distinguished or no scenario helps.
 
     It distinguishes the effects of sets of which one is present; where there are none, it excites what the runs
-    missed.  Without their evidence channels and noise are typical ones, and nothing is compared.  Where a set
-    cannot be distinguished by any drive with the channels that are logged, but could be with one more, the reason
-    names it.
+    missed.  Where a set cannot be distinguished by any drive with the channels that are logged, but could be with
+    one more, the reason names it.
     """
-    logged = _expected_channels(simulation.robot) if info is None else measured_channels(info.rows)
+    logged = runs.measured_channels(info.rows)
     if sets:
         return _separating_drive(simulation, sets, logged, info)
     names, bound = [limit.name for limit in missed], np.array([MOST[limit.name] for limit in missed])
@@ -110,7 +97,7 @@ def next_drive(
 
 
 def _separating_drive(
-    simulation: Simulation, sets: Sequence[tuple[str, ...]], logged: Sequence[str], info: Evidence | None
+    simulation: runs.Simulation, sets: Sequence[tuple[str, ...]], logged: Sequence[str], info: Evidence
 ) -> NextDrive | None:
     """Return the drive that best distinguishes all sets, with more channels if none does."""
     members = [effect_named(name) for group in sets for name in group]
@@ -126,12 +113,10 @@ def _separating_drive(
         if not drives:
             continue
         index, power, scenario, grade_deg = max(drives, key=lambda drive: drive[1])
-        now, power_now = (np.inf, 0.0) if info is None else _separation(sets, names, info.total(names)[0])
+        now, power_now = _separation(sets, names, info.total(names)[0])
         if lacking:
             channels = listed(lacking)
             reason = f"{groups} are one without {channels}; with it logged, their collinearity index is {index:.2g}"
-        elif info is None:
-            reason = f"the collinearity index of {groups} would be {index:.2g}"
         elif now > MIN_IMPROVEMENT_RATIO * index:
             was = f"{now:.2g}" if now < EXACT_INDEX else f"over {EXACT_INDEX:g}"
             reason = f"the collinearity index of {groups} falls from {was} to {index:.2g}"
@@ -162,30 +147,15 @@ def _separation(sets: Sequence[tuple[str, ...]], names: Sequence[str], a: Array)
     return index, power
 
 
-def _expected_channels(robot: Robot) -> tuple[str, ...]:
-    """Return the channels that are expected from a robot's description."""
-    if robot.on_omni_wheels:
-        return (effects.SPEED_X, effects.SPEED_Y, effects.CURRENT, effects.HEADING)
-    camera, motors = robot.describes("camera"), robot.describes("motors")
-    logged = {
-        effects.GYRO: True,
-        effects.ACCEL: True,
-        effects.SPEED_X: camera,
-        effects.SPEED_Y: camera,
-        effects.CURRENT: motors,
-        effects.TURNING_CURRENT: motors and robot.skids,
-    }
-    return tuple([name for name, there in logged.items() if there])
-
-
 def _drives(
-    simulation: Simulation, names: Sequence[str], channels: Sequence[str], info: Evidence | None
+    simulation: runs.Simulation, names: Sequence[str], channels: Sequence[str], info: Evidence
 ) -> list[tuple[str, float, Array]]:
     """Return each scenario on each grade, and its information (k, k) on parameters from channels.
 
-    Noise and scatter are those of the runs, or typical ones of channels that they do not have.
+    Noise and scatter are those of the runs, or typical ones of channels that they do not have.  Of measurements only
+    the pattern of holes is used.
     """
-    robot, driven, signals = simulation.robot, [], []
+    robot, driven, signals, dt_s = simulation.robot, [], [], 1.0 / CLOCK_HZ
     speed_mps = None  # that it cruises with
     if not isinstance(robot, BicycleRobot):
         if not robot.describes("motors"):
@@ -198,59 +168,49 @@ def _drives(
         except ConfigError:  # which it cannot drive
             continue
         motion = wheel_motion(robot, scenario.twist[: round(LONGEST_S * RATE_HZ)], 1.0 / RATE_HZ)
-        wheels = [
+        speed, steer = [
             np.ascontiguousarray(low_pass(x, 1.0 / RATE_HZ, FOLLOW_S)[:: round(RATE_HZ / CLOCK_HZ)])
             for x in (motion.wheel_speed_mps, motion.steer_rad)
         ]
+        level = np.zeros(len(speed))
+        measured = np.full((len(speed), len(CHANNELS)), np.nan)
+        measured[:, [CHANNELS.index(channel) for channel in channels]] = 0.0
+        parallel = np.abs(np.exp(1j * steer).mean(axis=1)) > runs.PARALLEL
+        measured[~parallel, CHANNELS.index(CURRENT)] = np.nan
         for grade_deg in GRADES_DEG[:1] if robot.on_omni_wheels else GRADES_DEG:  # those log no tilt
+            grade = roll = level
+            if grade_deg:
+                flat = move(simulation.planar, simulation.vector, dt_s, speed, steer, level, level)
+                yaw, steepness = (
+                    np.cumsum(flat["yaw_rate_radps"]) / CLOCK_HZ,
+                    math.tan(math.radians(grade_deg)),
+                )
+                ahead, left = steepness * np.cos(yaw), -steepness * np.sin(yaw)
+                grade, roll = np.arctan(ahead / np.hypot(1.0, left)), np.arctan(left)
             driven.append((name, grade_deg))
-            signals.append(_signals(simulation, wheels[0], wheels[1], grade_deg, channels))
+            signals.append(runs.Signals("", "", dt_s, 0.0, speed, steer, grade, roll, measured))
     if not signals:
         return []
     std = np.array([*TYPICAL_STD.values()])
     noise = Noise(np.zeros((len(std), 3)), np.zeros((len(std), ORDER + 1)), std)
     noise.growth[:, 0], noise.filters[:, 0] = std**2, 1.0
-    vector, scatter = simulation.vector, simulation.scatter
-    if info is not None:
-        vector, known = info.vector, np.isfinite(info.noise.filters).all(axis=1)
-        scatter = {name: info.scatter[name] for name, std in scatter.items() if std > 0}
-        for typical, measured in zip(noise, info.noise, strict=True):
-            typical[known] = measured[known]
-    of_drives = evidence_at(signals, simulation, vector, names, low_pass_of(signals), noise, scatter)
+    known = np.isfinite(info.noise.filters).all(axis=1)
+    for typical, own in zip(noise, info.noise, strict=True):
+        typical[known] = own[known]
+    scatter = {name: info.scatter[name] for name, assumed in simulation.scatter.items() if assumed > 0}
+    about = runs.low_pass_of(signals), noise, scatter
+    of_drives = evidence_at(signals, simulation, info.vector, names, *about)
     a, _ = of_drives.clusters(of_drives.places(names))
     return [(*drive, own) for drive, own in zip(driven, a, strict=True)]
 
 
-def _signals(
-    simulation: Simulation,
-    wheel_speed_mps: Array,
-    steer_rad: Array,
-    grade_deg: float,
-    channels: Sequence[str],
-) -> Signals:
-    """Return the signals of a drive without noise; of its measurements only the pattern of holes is used."""
-    level, dt_s = np.zeros(len(wheel_speed_mps)), 1.0 / CLOCK_HZ
-    measured = np.full((len(wheel_speed_mps), len(CHANNELS)), np.nan)
-    measured[:, [CHANNELS.index(name) for name in channels]] = 0.0
-    parallel = np.abs(np.exp(1j * steer_rad).mean(axis=1)) > PARALLEL
-    measured[~parallel, CHANNELS.index(effects.CURRENT)] = np.nan
-    grade = roll = level
-    if grade_deg:
-        flat = move(simulation.planar, simulation.vector, dt_s, wheel_speed_mps, steer_rad, level, level)
-        yaw = np.cumsum(flat["yaw_rate_radps"]) / CLOCK_HZ
-        steepness = math.tan(math.radians(grade_deg))
-        ahead, left = steepness * np.cos(yaw), -steepness * np.sin(yaw)
-        grade, roll = np.arctan(ahead / np.hypot(1.0, left)), np.arctan(left)
-    return Signals("", "", dt_s, 0.0, wheel_speed_mps, steer_rad, grade, roll, measured)
-
-
 def next_command(
-    drive: NextDrive | None, description: str, robot: Robot, terrains: Sequence[TerrainMatch]
+    drive: NextDrive | None, description: str, robot: Robot, terrains: Sequence[runs.TerrainMatch]
 ) -> str | None:
     """Return the command that simulates the next drive; None where none is suggested."""
     if drive is None:
         return None
-    default = DEFAULT_SOIL if drivable(robot, DEFAULT_SOIL) else HARD_SOIL
+    default = DEFAULT_SOIL if runs.drivable(robot, DEFAULT_SOIL) else HARD_SOIL
     soil = next((match.soil for match in terrains if match.soil), default)
     grade = f" --grade {drive.grade_deg:g}" if drive.grade_deg else ""
     words = f"--robot {shlex.quote(description)} --terrain {soil} --scenario {drive.scenario}{grade}"

@@ -9,7 +9,7 @@ from terrain.effects import CHANNELS, effect_named, vector_of
 from terrain.estimation.estimate import enriched, estimate_run
 from terrain.robots import load_robot
 from terrain.simulation.plants.planar import Ground, make_planar, replay
-from terrain.simulation.run import simulate, simulate_run
+from terrain.simulation.run import simulate_run
 
 TEXT = """name: mule
 drive: skid_steer
@@ -26,19 +26,6 @@ def robot(tmp_path_factory):
     path = tmp_path_factory.mktemp("robot") / "mule.yaml"
     path.write_text(TEXT)
     return load_robot(path)
-
-
-def test_a_simulated_run_has_no_currents_and_turns_as_its_geometry_says(robot):
-    twist = np.zeros((501, 3))
-    twist[50:, 0], twist[50:, 2] = 0.6, 0.4
-    ground = Ground(slip_ratio=1e-9, rolling_ratio=0.0, scrub_ratio=0.0)
-    streams = simulate(robot, twist, ground, 0).streams
-    assert streams["wheels"].channels == ("speed_left_mps", "speed_right_mps")
-    left, right = streams["wheels"].values[-1]
-    assert right - left == pytest.approx(0.4 * 1.08, abs=1e-6)
-    assert streams["imu"].channel("gyro_z_radps")[-1] == pytest.approx(0.4, abs=1e-6)
-    np.testing.assert_allclose(streams["odometry"].values[-1], [0.6, 0.0], atol=1e-6)
-    assert all(np.isfinite(streams[name].values).all() for name in ("wheels", "imu", "odometry"))
 
 
 def test_its_runs_are_replayed_explained_and_filtered_without_what_is_not_described(robot):

@@ -14,7 +14,6 @@ from studies.blind_trials.trial import simulation_of
 import terrain.discrepancy.diagnose as diagnose_module
 from pipelines.report.results import as_json
 from terrain.discrepancy.diagnose import MIN_RUNS, diagnose
-from terrain.discrepancy.next_drive import next_command
 from terrain.discrepancy.verdict import Verdict
 from terrain.effects import CURRENT, GYRO, HEADING, effect_named
 from terrain.errors import DataError
@@ -215,17 +214,6 @@ def test_exact_twins_are_ambiguous_and_the_channel_that_distinguishes_them_is_na
     assert values["gyro_scale_ratio"] == pytest.approx(0.1, abs=0.01)
     assert 1 / (1 + values["effective_track_ratio"]) == pytest.approx(1.1, abs=0.02)
     assert HEADING in diagnosis.next_drive.reason
-
-
-def test_a_next_drive_of_a_car_is_one_that_it_can_drive(worlds):
-    world = worlds("adap2e")
-    straight = world.drives._replace(twists=[np.tile([0.4, 0.0, 0.0], (2001, 1))] * 6)
-    runs = hidden_runs(world.robot, straight, np.random.SeedSequence(2), {})
-    diagnosis = diagnose(runs, world.simulation)
-    assert "understeer_s2pm" in [limit.name for limit in diagnosis.not_excited]
-    command = next_command(diagnosis.next_drive, "adap2e", world.robot, ())
-    assert "--robot adap2e" in command
-    assert "spot_turn" not in command
 
 
 def test_an_unfit_run_is_excluded_and_the_rest_is_diagnosed(worlds):

@@ -65,16 +65,6 @@ def test_three_causes_are_found_with_their_values_by_relinearisation(three):
     assert rivals_of(problem, fit.info, start, fit.causes) == {cause.name: {} for cause in fit.causes}
 
 
-def test_changes_are_counted_from_the_simulation_that_was_given(three, posed, solve):
-    fit, half = three[1], {name: 0.5 * value for name, value in HIDDEN.items()}
-    again = solve(posed(HIDDEN, built_in=half))
-    assert names(again.causes) == names(fit.causes)
-    whole = dict(zip(fit.names, zip(fit.change, np.sqrt(np.diag(fit.cov)), strict=True), strict=True))
-    for name, change in zip(again.names, again.change, strict=True):
-        assert change + half[name] == pytest.approx(whole[name][0], abs=whole[name][1])
-    np.testing.assert_allclose(again.info.fit(again.names)[0], again.change)
-
-
 def test_a_set_of_causes_is_not_reached_twice(three, monkeypatch):
     """One comes, drives another out and goes itself: what is left was there before, and so it would go on."""
     problem, fit = three

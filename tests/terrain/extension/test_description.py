@@ -1,7 +1,6 @@
 """Files of extended robots: what is written is read again, what it rests on, and the region that it holds in."""
 
 import math
-import pickle
 import warnings
 from dataclasses import replace
 
@@ -63,20 +62,6 @@ def test_a_file_that_is_one_line_is_not_extended(tmp_path):
     path.write_text(yaml.safe_dump(content, default_flow_style=True))
     with pytest.raises(ConfigError, match="one section a line is required"):
         extended_yaml(path, *ONE)
-
-
-def test_effects_cannot_be_changed_and_travel():
-    robot = robot_from("mine.yaml", described())
-    with pytest.raises(TypeError):
-        robot.effects[R] = 1.0
-    with pytest.raises(ValueError, match="read-only"):
-        robot.effects_cov[0, 0] = 1.0
-    there = pickle.loads(pickle.dumps(robot))
-    assert (there, hash(there)) == (robot, hash(robot))
-    np.testing.assert_array_equal(there.effects_cov, robot.effects_cov)
-    unknown = described()
-    del unknown["effects"]["covariance"]
-    assert np.isnan(robot_from("mine.yaml", unknown).effects_cov).all()
 
 
 def entry(value, unit="ratio"):
@@ -166,20 +151,6 @@ NAMES = ("agrimaro", "husky", "warthog", "marmotte")
 
 def yaml_of(name):
     return yaml.safe_load((data_folder("robots") / f"{name}.yaml").read_text())
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_number_is_assumed_where_its_source_says_so_and_only_there(name):
-    content = yaml_of(name)
-    sections = {"": content} | {f"{key}.": value for key, value in content.items() if "source" not in value}
-    expected = {
-        f"{prefix}{key}"
-        for prefix, entries in sections.items()
-        for key, each in (entries.items() if isinstance(entries, dict) else ())
-        if isinstance(each, dict) and each.get("source", "").startswith("assumed")
-    }
-    robot = load_robot(name)
-    assert robot.assumed == replace(robot, track_m=robot.track_m).assumed == expected
 
 
 @pytest.mark.parametrize("name", NAMES)
