@@ -1,6 +1,7 @@
 """Rows of observers: what a tick has of each stream, live as of a whole log, and samples that cannot be."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -110,12 +111,6 @@ def test_a_log_without_what_the_observer_takes_is_refused(run):
         rows_of(without(run, "wheels"))
 
 
-def fed(run, change):
-    """Return rows of a run whose streams are changed, by the name of the stream."""
-    streams = {name: change(name, stream) for name, stream in run.streams.items()}
-    return rows_of(RunLog("a", "orchard_ugv", {name: stream for name, stream in streams.items() if stream}))
-
-
 def test_stamps_that_are_no_time_and_channels_that_are_unknown_do_not_take_the_others_along(run):
     feed = feed_of(run)
     imu = run.streams["imu"].values[:4].copy()
@@ -130,29 +125,16 @@ def test_stamps_that_are_no_time_and_channels_that_are_unknown_do_not_take_the_o
 
 
 def test_a_pose_that_is_lost_leaves_the_satellites_and_bad_fixes_are_none(run):
-    def lost(name, stream):
-        if name == "pose":
-            return Stream(stream.time_s, np.full_like(stream.values, np.nan), stream.channels)
-        return stream
-
-    def spoilt(column, value):
-        def change(name, stream):
-            if name == "pose":
-                return None
-            if name not in ("gnss", "compass"):
-                return stream
-            values = stream.values.copy()
-            if name == "gnss":
-                values[:, stream.channels.index(column)] = value
-            return Stream(stream.time_s, values, stream.channels)
-
-        return change
-
-    _, rows, _ = fed(run, lost)
-    assert np.isfinite(rows[:, 2]).sum() == len(run.streams["gnss"])
-    _, rows, dropped = fed(run, spoilt("std_position_m", 1.5))
+    pose, gnss = run.streams["pose"], run.streams["gnss"]
+    lost = Stream(pose.time_s, np.full_like(pose.values, np.nan), pose.channels)
+    _, rows, _ = rows_of(replace(run, streams={**run.streams, "pose": lost}))
+    assert np.isfinite(rows[:, 2]).sum() == len(gnss)
+    values = gnss.values.copy()
+    values[:, gnss.channels.index("std_position_m")] = 1.5
+    spoilt = replace(run, streams={**run.streams, "gnss": Stream(gnss.time_s, values, gnss.channels)})
+    _, rows, dropped = rows_of(without(spoilt, "pose"))
     assert np.isnan(rows[:, 2]).all()
-    assert dropped["gnss: inaccurate"] == len(run.streams["gnss"])
+    assert dropped["gnss: inaccurate"] == len(gnss)
 
 
 @pytest.mark.parametrize(("tick_s", "late"), [(0.35, False), (0.45, True)])
