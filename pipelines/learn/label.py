@@ -138,7 +138,7 @@ def run(
     if settings.sets and settings.run is not None:
         terrain = "" if settings.remove else settings.terrain or ""
         changed = set_label(settings.data, settings.run, terrain, settings.from_s, settings.to_s)
-        return LabelResult(run_id=settings.run, terrain=terrain, **changed._asdict())
+        return LabelResult(run_id=settings.run, terrain=terrain, **changed)
     return DoubtfulResult(settings.data, *doubtful_windows(settings.data, settings.run))
 
 

@@ -182,12 +182,8 @@ class TopicMapping(Strict):
     labels: str = ""
 
 
-class RunFiles(NamedTuple):
-    """Files of one run: the text for each word in braces, and of each stream the place of its file as on disk."""
-
-    words: dict[str, str]
-    places: dict[str, str]
-
+RunFiles = tuple[dict[str, str], dict[str, str]]
+"""Files of one run: the text for each word in braces, and of each stream the place of its file as on disk."""
 
 ReadMessages = Callable[[Path, str, MessageStream, "Counter[str] | None"], Stream]
 """Reads a stream of messages: file, name of the stream, its description, and what counts repairs."""
@@ -323,7 +319,7 @@ def find_borealtc(folder: Path) -> list[Callable[..., RunLog]]:
     A run of which one file is missing has a reader too: it raises ``LogError`` with the name of that file.
     """
     mapping = load_mapping(data_folder("layouts") / "borealtc.yaml")
-    files = {(each.words["terrain"], each.words["run"]): each for each in run_files(folder, mapping)}
+    files = {(each[0]["terrain"], each[0]["run"]): each for each in run_files(folder, mapping)}
     read = partial(read_run, folder, mapping, by="BorealTC layout", linked_folders=True)
     return [
         partial(read, files[terrain, run])
@@ -349,7 +345,7 @@ def run_files(folder: Path, mapping: TableMapping) -> list[RunFiles]:
             place = path.relative_to(folder).as_posix()
             if match := re.fullmatch(pattern, normal_name(place)):
                 words = match.groupdict()
-                runs.setdefault(repr(sorted(words.items())), RunFiles(words, {})).places[name] = place
+                runs.setdefault(repr(sorted(words.items())), (words, {}))[1][name] = place
     return [run for _, run in sorted(runs.items())]
 
 
@@ -369,12 +365,12 @@ def read_run(
     empty or broken, or the streams do not overlap in time; ``ConfigError`` where a package is missing, or nothing
     reads messages here.
     """
-    words = files.words
+    words, places = files
     dropped: Counter[str] = Counter()
     streams: dict[str, Stream] = {}
     names = []
     for name, stream in mapping.streams.items():
-        path = folder / files.places.get(name, stream.file.format(**words))
+        path = folder / places.get(name, stream.file.format(**words))
         check_log_file(path, path.parent if linked_folders else folder)
         names.append(path.relative_to(folder).as_posix())
         if stream.messages is None:

@@ -76,20 +76,15 @@ class Assembler:
 
     def take(self, time_s: float, part: Part) -> None:
         """Take a part; one of a sample that has ended, or that came already, is dropped and counted."""
-        if part.counter is not None and part.counter == self._last:
+        counter, again = part.counter, not self._row.keys().isdisjoint(part.values)
+        if counter is not None and (counter == self._last or (again and counter == self._counter)):
             self._dropped[f"{self._stream}: repeated or late"] += 1
             return
-        known = part.counter is not None and self._counter is not None
-        again = not self._row.keys().isdisjoint(part.values)
-        if again and known and part.counter == self._counter:
-            self._dropped[f"{self._stream}: repeated or late"] += 1
-            return
-        if again or (known and part.counter != self._counter):
+        if again or (None not in (counter, self._counter) and counter != self._counter):
             self.finish()
         if not self._row:
             self._time_s = time_s
-        if part.counter is not None:
-            self._counter = part.counter
+        self._counter = self._counter if counter is None else counter
         self._row |= part.values
         if part.n_out_of_range:
             self._dropped[f"{self._stream}: out of range"] += part.n_out_of_range

@@ -29,7 +29,7 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
@@ -313,15 +313,6 @@ Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is Non
 """A number that is null in JSON where it is not finite."""
 
 
-class ChangedLabels(NamedTuple):
-    """Interval whose label was set or removed, and all labels of the run."""
-
-    folder: Path
-    start_s: float
-    end_s: float
-    labels: tuple[Label, ...]
-
-
 class RecordedWindow(BaseModel):
     """A window of a recorded run, on the clock of the run.
 
@@ -412,8 +403,10 @@ def label_changes(labels: Iterable[Label]) -> list[tuple[float, str]]:
 
 def set_label(
     data: Path, run_id: str, terrain: str, start_s: float | None = None, end_s: float | None = None
-) -> ChangedLabels:
-    """Set a label of a run, or remove it by an empty terrain; all else in its ``run.json`` stays.
+) -> dict[str, Any]:
+    """Set a label of a run, or remove it by an empty terrain; return its folder, the interval and all labels, by name.
+
+    All else in its ``run.json`` stays.
 
     ``data`` is a run folder or has them.  The whole run, with labels beyond its samples, is taken where no interval is
     given.  ``ConfigError`` where there is no such run, or the interval is outside of it; ``LogError`` where it is
@@ -436,7 +429,7 @@ def set_label(
     document = read_json(folder / "run.json", run_id, LogError)
     document["labels"] = [label._asdict() for label in labels]
     atomic_write(folder / "run.json", json.dumps(document, indent=2, allow_nan=False) + "\n")
-    return ChangedLabels(folder, start_s, end_s, labels)
+    return {"folder": folder, "start_s": start_s, "end_s": end_s, "labels": labels}
 
 
 def relabelled(labels: Iterable[Label], start_s: float, end_s: float, terrain: str) -> tuple[Label, ...]:

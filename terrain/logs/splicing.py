@@ -88,12 +88,8 @@ def parts_under(runs: Mapping[str, RunLog], windows: Windows) -> list[Part]:
     return parts
 
 
-class SplicedRun(NamedTuple):
-    """A log over several grounds; the run behind each of its labels, and whether it was spliced."""
-
-    log: RunLog
-    runs: tuple[str, ...]
-    spliced: bool
+SplicedRun = tuple[RunLog, tuple[str, ...], bool]
+"""A log over several grounds; the run behind each of its labels, and whether it was spliced."""
 
 
 def sequences_of(
@@ -103,14 +99,14 @@ def sequences_of(
 
     None is spliced where the terrain never changes.
     """
-    found = []
+    found: list[SplicedRun] = []
     ordered = order_stretches([s for part in parts for s in stretches_of(part, rng)], rng)
     if len(ordered) >= 2:
         log = splice_runs(ordered, channels, run_id)
-        found.append(SplicedRun(log, tuple(part.run.run_id for part in ordered), True))
+        found.append((log, tuple(part.run.run_id for part in ordered), True))
     counts = Counter(part.run.run_id for part in parts)
     logs = {part.run.run_id: part.run for part in parts if counts[part.run.run_id] > 1}
-    return *found, *(SplicedRun(log, (name,) * len(log.labels), False) for name, log in logs.items())
+    return *found, *((log, (name,) * len(log.labels), False) for name, log in logs.items())
 
 
 def splice_runs(parts: Sequence[Part], channels: Mapping[str, Sequence[str]], run_id: str) -> RunLog:
