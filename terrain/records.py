@@ -8,7 +8,7 @@ function given a record may trust it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -305,15 +305,9 @@ class Windows:
     def __getitem__(self, index: Any) -> Windows:
         if isinstance(index, int | np.integer):
             index = [int(index)]
-        return Windows(
-            {name: values[index] for name, values in self.values.items()},
-            self.channels,
-            self.rate_hz,
-            self.length_s,
-            self.start_s[index],
-            self.run_id[index],
-            self.terrain[index],
-        )
+        values = {name: values[index] for name, values in self.values.items()}
+        of_each = {name: getattr(self, name)[index] for name in ("start_s", "run_id", "terrain")}
+        return replace(self, values=values, **of_each)
 
 
 class TargetStatus(StrEnum):

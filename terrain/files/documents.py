@@ -37,13 +37,10 @@ def number(place: str, entry: Any, unit: str, low: float | None = None) -> float
     if not isinstance(entry["source"], str) or not entry["source"].strip():
         raise ConfigError(f"{place} has no source: say where the number is from, or 'assumed'")
     value = entry["value"]
-    within = not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value)
-    if low is None and not (within and value > 0):
-        raise ConfigError(f"{place} is {shown(value)}, a number above zero is required")
-    if low is not None and not (within and value >= low):
-        raise ConfigError(
-            f"{place} is {shown(value)}, a number{' from zero up' if low == 0 else ''} is required"
-        )
+    is_number = not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value)
+    if not is_number or (value <= 0 if low is None else value < low):
+        more = " above zero" if low is None else " from zero up" if low == 0 else ""
+        raise ConfigError(f"{place} is {shown(value)}, a number{more} is required")
     return float(value)
 
 
