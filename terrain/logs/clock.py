@@ -148,15 +148,15 @@ def estimate_clock(run: RunLog, *, track_m: float) -> ClockEstimate:
     >>> found.status.value, round(found.offset_s, 2), abs(found.rate) < 1e-3
     ('estimated', 0.3, True)
     """
-    found = yaw_rate_pair(run, track_m)
+    smooth = yaw_rate_pair(run, track_m)
     reference_s = float(run.streams["wheels"].time_s[0])
 
     def none(status: DelayStatus, correlation: float = np.nan) -> ClockEstimate:
         return ClockEstimate(*5 * (np.nan,), correlation, status, reference_s)
 
-    if found is None:
+    if smooth is None:
         return none(DelayStatus.NOT_EXCITED)
-    pair, start_s, sigma_s = found
+    pair, start_s, sigma_s = smooth
     turning = (pair.measured - np.mean(pair.measured)) ** 2
     if np.sqrt(np.mean(turning)) < MIN_YAW_RATE_STD_RADPS:
         return none(DelayStatus.NOT_EXCITED)
@@ -235,9 +235,9 @@ def offsets_apart_s(runs: Sequence[RunLog], track_m: Callable[[RunLog], float]) 
     offsets_s = {}
     for run in runs:
         try:
-            found = estimate_clock(run, track_m=track_m(run))
+            clock = estimate_clock(run, track_m=track_m(run))
         except DataError:  # no gyro, or no speeds of two sides
             continue
-        if found.is_known and abs(found.offset_s) > max(MAX_APART_S, 3.0 * found.offset_std_s):
-            offsets_s[run.run_id] = found.offset_s
+        if clock.is_known and abs(clock.offset_s) > max(MAX_APART_S, 3.0 * clock.offset_std_s):
+            offsets_s[run.run_id] = clock.offset_s
     return offsets_s

@@ -178,7 +178,7 @@ def possible_pairs(prints: Iterable[RunPrint]) -> list[tuple[int, int]]:
     [(0, 1)]
     """
     digests: list[bytes] = []
-    found = []
+    matches = []
     with ExitStack() as stack:
         files = [stack.enter_context(TemporaryFile()) for _ in range(N_FILES)]
         for run, each in enumerate(prints):
@@ -192,8 +192,8 @@ def possible_pairs(prints: Iterable[RunPrint]) -> list[tuple[int, int]]:
             file.seek(0)
             records = np.frombuffer(file.read(), PRINT)
             one, other = (records[at] for at in _equal(records["code"], records["run"]))
-            found.append((one["run"], other["run"], other["time_s"] - one["time_s"]))
-    first, second, offset_s = map(np.concatenate, zip(*found, strict=True))
+            matches.append((one["run"], other["run"], other["time_s"] - one["time_s"]))
+    first, second, offset_s = map(np.concatenate, zip(*matches, strict=True))
     order = np.lexsort((offset_s, second, first))
     first, second, offset_s = first[order], second[order], offset_s[order]
     a, b = slice(None, 1 - MIN_EQUAL), slice(MIN_EQUAL - 1, None)
@@ -248,17 +248,17 @@ def shared_stretches(runs: Sequence[RunLog]) -> tuple[SharedStretch, ...]:
     ('a', 'b', 10, 100)
     """
     pairs, times_s = _matches(*_fingerprints(runs))
-    found, known = [], set()
+    shared, known = [], set()
     for first, second in dict.fromkeys(map(tuple, pairs.tolist())):
         rows = times_s[(pairs == (first, second)).all(axis=1)]
         stretches = _stretches(rows, runs[first], runs[second])
-        found += stretches
+        shared += stretches
         known |= {(first, second)} if stretches else set()
     for first, second in _same_digests(map(_digest, runs)):
         if (first, second) not in known:
             ids = runs[first].run_id, runs[second].run_id
-            found.append(SharedStretch(*ids, *_span(runs[first]), *_span(runs[second])))
-    return tuple(sorted(found))
+            shared.append(SharedStretch(*ids, *_span(runs[first]), *_span(runs[second])))
+    return tuple(sorted(shared))
 
 
 def _matches(codes: Array, start: Array, peaks: Array) -> tuple[Array, Array]:
@@ -321,19 +321,19 @@ def distinct_runs(runs: Sequence[RunLog], *, merge: bool) -> tuple[list[RunLog],
     DataError
         if runs share a stretch and are not to be merged, or label it differently.
     """
-    found = shared_stretches(runs)
-    if not found:
+    stretches = shared_stretches(runs)
+    if not stretches:
         return list(runs), ()
-    _refuse_other_labels(runs, found)
+    _refuse_other_labels(runs, stretches)
     if not merge:
         raise DataError(
-            f"{'; '.join(sentences(found))}: held out, they would be recognised and not classified; remove "
+            f"{'; '.join(sentences(stretches))}: held out, they would be recognised and not classified; remove "
             "one of them, or use --merge-duplicates to treat them as one run"
         )
-    return merge_runs(runs, found), groups_of(found)
+    return merge_runs(runs, stretches), groups_of(stretches)
 
 
-def sentences(found: Sequence[SharedStretch]) -> list[str]:
+def sentences(stretches: Sequence[SharedStretch]) -> list[str]:
     """Return what the shared stretches are, in words; beyond the first ones their number.
 
     Examples
@@ -344,10 +344,10 @@ def sentences(found: Sequence[SharedStretch]) -> list[str]:
     shown = [
         f"runs {each.first} and {each.second} hold the same measurements for {each.duration_s:.1f} s "
         f"(from {each.first_start_s:.1f} s of {each.first} and {each.second_start_s:.1f} s of {each.second})"
-        for each in found[:MAX_SHOWN]
+        for each in stretches[:MAX_SHOWN]
     ]
-    if len(found) > MAX_SHOWN:
-        shown.append(f"and so do {len(found) - MAX_SHOWN} more pairs of runs")
+    if len(stretches) > MAX_SHOWN:
+        shown.append(f"and so do {len(stretches) - MAX_SHOWN} more pairs of runs")
     return shown
 
 

@@ -98,15 +98,15 @@ def stream_topic(stream: str, channels: Sequence[str], taken: Iterable[StreamTop
 
     def accepted_names(names: Iterable[str], fallback: str, reserved: Iterable[str]) -> list[str]:
         """Return a name for each, as ROS accepts them: lower-case letters, digits and single underlines."""
-        used, found = {each.replace("_", "") for each in reserved}, []
+        used, plain_names = {name.replace("_", "") for name in reserved}, []
         for number, name in enumerate(names):
             plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
             plain = plain if re.match(r"[a-z]", plain) else f"{fallback}_{number}"
             while plain.replace("_", "") in used:
                 plain = f"{plain}_{number}"
             used.add(plain.replace("_", ""))
-            found.append(plain)
-        return found
+            plain_names.append(plain)
+        return plain_names
 
     others = [each.topic.removeprefix(PREFIX) for each in taken]
     (name,) = accepted_names([stream], f"stream_{len(others)}", [*RESERVED, *others])

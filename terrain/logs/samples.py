@@ -269,11 +269,11 @@ def one_spelling(place: str, runs: Sequence[RunLog], *, repair: bool = False) ->
                 "merge them with --repair"
             )
         better |= {each: names[0] for every in spelt.values() for each in every}
-    found = []
+    respelt = []
     for run in runs:
         if any(better[terrain] != terrain for terrain in run.terrains):
             labels = tuple(label._replace(terrain=better[label.terrain]) for label in run.labels)
             n = sum(normal_name(each.terrain) != normal_name(better[each.terrain]) for each in run.labels)
             run = replace(run, labels=labels, dropped=Counter(run.dropped) + Counter({RESPELT: n}))
-        found.append(run)
-    return found
+        respelt.append(run)
+    return respelt
