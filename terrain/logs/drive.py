@@ -109,7 +109,7 @@ from terrain.logs.samples import (
     short_name,
 )
 from terrain.logs.schema import POSE_CHANNELS
-from terrain.logs.tables import read_table, row_number, text_rows
+from terrain.logs.tables import read_groups, row_number, text_rows
 from terrain.records import Array, Label, RunLog
 
 FILE_NAME = "samples.csv.gz"
@@ -193,16 +193,16 @@ class _Session:
         self.terrain = numbered[1] if numbered else ""
         file = check_log_file(path / FILE_NAME, path)
         self.file, self.robot = short_name(file), robot.name
-        read = [*_KEYS, *_POSE, *(column for pairs in STREAMS.values() for column, _ in pairs.values())]
-        table = read_table(file, read)
-        keys = _checked_keys(file, table[:, : len(_KEYS)])
+        sources = {name: list(pairs.values()) for name, pairs in STREAMS.items()}
+        groups = {name: [column for column, _ in pairs] for name, pairs in sources.items()}
+        log = read_groups(file, {"keys": _KEYS, "pose": _POSE, **groups})
+        keys = _checked_keys(file, log["keys"])
         n, k, _ = keys.shape
         self.step, self.steady = (keys[:, 0, i].astype(np.int64) for i in (0, 2))
         self.period_s = round(float(keys[0, -1, 3] - keys[0, 0, 3]) / (k - 1), 9)
-        columns = dict(zip(read, table.T.reshape(-1, n, k), strict=True))
         self.values = {
-            name: np.stack([columns[column] * factor for column, factor in pairs.values()], axis=-1)
-            for name, pairs in STREAMS.items()
+            name: log[name].reshape(n, k, -1) * [factor for _, factor in pairs]
+            for name, pairs in sources.items()
         }
         wheels, imu = self.values["wheels"], self.values["imu"]
         self.holds = [usual_hold(wheel, self.period_s) for wheel in np.moveaxis(wheels, -1, 0)]
@@ -211,7 +211,7 @@ class _Session:
         axes = find_axes([(*w.T, i[:, 0], i[:, 1:]) for w, i in zip(wheels, imu, strict=True)], self.period_s)
         imu *= (axes.gyro_z, *axes.accel)
         self.repairs = axes.repairs()
-        self.pose = np.stack([columns[name] for name in _POSE], axis=-1)  # as published
+        self.pose = log["pose"].reshape(n, k, 3)  # as published
         self.frame_yaw = self.pose[:, :N_FRAME, 2].mean(axis=1)  # of the frame of a window's positions
         if is_first_pose(self.pose, wheels, self.period_s):
             self.frame_yaw = self.pose[:, 0, 2]
@@ -484,27 +484,24 @@ class _Recording:
         self.name, self.robot, self.terrain = short_name(check_log_file(path, path.parent)), robot, terrain
         self.session = normal_name(f"{path.resolve().parent.name}_{path.name.removesuffix(SUFFIX)}")
         self.dropped: Counter[str] = Counter() if repairs is None else repairs
-        columns = ["time", "calib_step", *WHEELS.values(), *IMU.values(), *DESIRED.values()]
-        columns += [*_POSITION, *_QUATERNION]
-        table = read_table(path, columns, repairs=repairs)
+        groups = {"keys": ("time", "calib_step"), "wheels": (*WHEELS.values(),), "imu": (*IMU.values(),)}
+        groups |= {"commands": (*DESIRED.values(),), "position": _POSITION, "quaternion": _QUATERNION}
+        log = read_groups(path, groups, repairs=repairs)
+        time_s = log["keys"][:, 0]
         state = np.array([cells[0] for _, cells in text_rows(path, ["calib_state"]) if cells is not None])
-        if len(table) < 2:
-            raise LogError(f"{self.name}: has {len(table)} rows of data, at least 2 are needed")
-        if len(state) != len(table):  # rows of another length, which both readers leave out alike
+        if len(time_s) < 2:
+            raise LogError(f"{self.name}: has {len(time_s)} rows of data, at least 2 are needed")
+        if len(state) != len(time_s):  # rows of another length, which both readers leave out alike
             raise LogError(f"{self.name}: its rows do not have one state each")
-        kept = rising_rows(self.name, table[:, 0], partial(row_number, path), repairs)
-        table, state = table[kept], state[kept]
-        column = dict(zip(columns, table.T, strict=True))
-        self.time_s, step = column["time"], column["calib_step"]
+        kept = rising_rows(self.name, time_s, partial(row_number, path), repairs)
+        keys, wheels, imu, commands, position, quaternion = (values[kept] for values in log.values())
+        state, (self.time_s, step) = state[kept], keys.T
         for row in np.flatnonzero(~((step >= 0) & (step == np.floor(step)))).tolist():
             fault = f"calib_step at row {row + 2} is {step[row]:.15g}; it must be a whole number from 0 up"
             raise LogError(f"{self.name}: {fault}")
-        wheels, imu, commands = (
-            np.column_stack([column[name] for name in names.values()]) for names in (WHEELS, IMU, DESIRED)
-        )
         robot.check(self.name, wheels[:, :2])
         self.period_s = float(np.median(np.diff(self.time_s)))
-        moving = (np.abs(wheels[:, :2]) >= MIN_MOVING_RADPS).any(axis=1)
+        moving = np.asarray((np.abs(wheels[:, :2]) >= MIN_MOVING_RADPS).any(axis=1))
         breaks = np.diff(self.time_s, prepend=self.time_s[0]) > BREAK_PERIODS * self.period_s
         self.cuts, n_still = cut_recording(step, state == COMMANDED, moving, breaks, self.period_s)
         if not self.cuts:
@@ -530,8 +527,7 @@ class _Recording:
             self.streams["imu"] = tuple(IMU), imu * (*axes.gyro(), *axes.accel)
         else:
             self.dropped[NOT_RECORDED] += imu.shape[1]
-        position = np.column_stack([column[name] for name in _POSITION])
-        poses, self.posed, twist = self._lidar(position, *(column[name] for name in _QUATERNION))
+        poses, self.posed, twist = self._lidar(position, *quaternion.T)
         if not np.isfinite(twist).any():
             raise LogError(f"{self.name}: its lidar has lost the robot throughout: no pose gives a speed")
         self.streams |= {"lidar": (CHANNELS, twist), "pose": (POSE_CHANNELS, poses)}

@@ -54,7 +54,7 @@ from terrain.logs.samples import (
     whole_run_label,
 )
 from terrain.logs.schema import POSE_CHANNELS, WHEELS_CHANNELS
-from terrain.logs.tables import TextLayout, header_of, read_table, row_number
+from terrain.logs.tables import TextLayout, header_of, read_groups, row_number
 from terrain.records import Array, RunLog
 
 CAMERA_FILE = "camera_params.json"
@@ -131,26 +131,24 @@ def read_run(path: Path, root: Path, *, repair: bool = False) -> RunLog:
     name, parts = short_name(path), path.relative_to(root).parts
     repairs = Counter[str]() if repair else None
     with_camera = parts[0] != _MOTORS_ONLY or _POSE[0] in header_of(path, _LAYOUT)
-    names = ["t", *_SET_RATES, *_COUNTS, *_RATES, *_CURRENTS, *((*_TWIST, *_POSE) if with_camera else ())]
-    table = dict(zip(names, read_table(path, names, layout=_LAYOUT, repairs=repairs).T, strict=True))
+    groups = {"time": ["t"], "set_rates": _SET_RATES, "counts": _COUNTS, "rates": _RATES}
+    groups |= {"currents": _CURRENTS} | ({"twist": _TWIST, "pose": _POSE} if with_camera else {})
+    log = read_groups(path, groups, layout=_LAYOUT, repairs=repairs)
     row_of = partial(row_number, path, layout=_LAYOUT)
     checked = partial(checked_stream, name, row_of=row_of, repairs=repairs)
-    set_rates, counts, rates, currents, twist, seen = (
-        np.column_stack([table[each] for each in group]) if group[0] in table else np.zeros((0, 3))
-        for group in (_SET_RATES, _COUNTS, _RATES, _CURRENTS, _TWIST, _POSE)
-    )
-    time_s = table["t"] * 1e-3
+    time_s, rates, counts = log["time"][:, 0] * 1e-3, log["rates"], log["counts"]
     for rate, count in zip(rates.T, counts.T, strict=True):
         rate *= _scale(time_s, rate, count)
     converted = Counter({SCALED: len(_RATES), NO_SIGN: len(_CURRENTS)})
-    motors = np.column_stack([rates, currents])
+    motors = np.column_stack([rates, log["currents"]])
     streams = {"wheels": checked(time_s, motors, WHEELS_CHANNELS, columns=[*_RATES, *_CURRENTS])}
     if with_camera:
+        twist, seen = log["twist"], log["pose"]
         # commanded motor speeds are those of terrain.kinematics.wheels.rolling_matrix
         direction = np.radians([150.0, 270.0, 390.0])
         rolling = np.stack([np.cos(direction), np.sin(direction), np.full(3, _WHEEL_DISTANCE_M)], axis=-1)
         expected = np.nan_to_num(twist) @ (rolling * (_GEAR / _WHEEL_RADIUS_M)).T
-        apart = np.nanmax(np.abs(set_rates - expected), axis=1, initial=0.0)
+        apart = np.nanmax(np.abs(log["set_rates"] - expected), axis=1, initial=0.0)
         for row in np.flatnonzero(apart > MAX_COMMAND_ERROR_RADPS)[:1].tolist():
             raise LogError(
                 f"{name}: at row {row_of(row)} the commanded motor speeds are {apart[row]:.3g} rad/s away from "

@@ -114,6 +114,13 @@ def read_table(
     return np.array(table, dtype=np.float64).reshape(len(table), len(columns))
 
 
+def read_groups(path: Path, groups: Mapping[str, Sequence[str]], **options: Any) -> dict[str, Array]:
+    """Return groups of named columns of a file, each (n, c), as :func:`read_table` reads them."""
+    table = read_table(path, [column for columns in groups.values() for column in columns], **options)
+    ends = np.cumsum([len(columns) for columns in groups.values()])
+    return dict(zip(groups, np.split(table, ends[:-1], axis=1), strict=True))
+
+
 def row_number(path: Path, index: int, *, layout: TextLayout = PLAIN) -> int:
     """Return the number of the row of a sample, as an editor shows it (blank ones count); of a ``.mat`` its place."""
     kind = path.suffix.lower()
