@@ -1,8 +1,9 @@
-"""Run folders, and runs as topics: whatever is written is read back, whole or not at all, under one digest."""
+"""Run folders, and runs as topics: whatever is written is read back, whole or not at all, under one digest; labels."""
 
 import json
 import string
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ from hypothesis import strategies as st
 
 from terrain.errors import DataError, LogError, TerrainError
 from terrain.logs.mapping import Faults, Topic
-from terrain.logs.run_folders import data_digest, find_runs, read_run, write_run
+from terrain.logs.run_folders import data_digest, find_runs, read_run, relabelled, write_run
 from terrain.logs.run_topics import RUN_TOPIC, read_document, run_messages, run_of, string_of
+from terrain.logs.samples import longest_rise
 from terrain.records import Label, RunLog, Stream
 
 
@@ -199,3 +201,33 @@ def test_a_run_that_is_too_long_for_stamps_and_a_changed_document_are_refused(ma
         with pytest.raises(LogError) as raised:
             again(make_run(), old, new)
         assert "\n" not in str(raised.value)
+
+
+times = st.integers(0, 20).map(float)
+intervals = st.tuples(times, times).filter(lambda each: each[0] < each[1])
+
+
+@settings(max_examples=50)
+@given(st.lists(st.tuples(intervals, st.sampled_from(["a", "b", ""])), max_size=6))
+def test_the_last_label_of_an_instant_holds(changes):
+    """Two routes to the label of an instant: the labels after all changes, and the last change over it."""
+    labels = ()
+    for (start_s, end_s), terrain in changes:
+        labels = relabelled(labels, start_s, end_s, terrain)
+    assert all(one.end_s <= other.start_s for one, other in pairwise(labels))
+    for instant in np.arange(0.5, 20.0):
+        last = [t for (start_s, end_s), t in changes if start_s <= instant < end_s]
+        holds = [label.terrain for label in labels if label.start_s <= instant < label.end_s]
+        assert holds == [t for t in last[-1:] if t]
+    joined = [one for one, other in pairwise(labels) if one[1:] == (other[0], other[2])]
+    assert joined == []
+
+
+@given(st.lists(st.integers(-20, 20), max_size=12))
+def test_the_longest_rise_rises_and_nothing_longer_does(numbers):
+    rise = [numbers[i] for i in longest_rise(np.array(numbers, dtype=float))]
+    assert all(a < b for a, b in pairwise(rise))
+    best = [1] * len(numbers)  # by the plain quadratic recursion
+    for i, number in enumerate(numbers):
+        best[i] = 1 + max((best[j] for j in range(i) if numbers[j] < number), default=0)
+    assert len(rise) == max(best, default=0)
