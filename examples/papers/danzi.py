@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,18 +33,12 @@ from terrain.control.pid import (
     wheel_step,
 )
 from terrain.estimation.consistency import lagged_slip, lagged_slip_at
-from terrain.estimation.estimate import (
-    THESIS_EMA_ALPHA,
-    THESIS_SAMPLE_TIME_S,
-    Estimate,
-    enriched,
-    estimate_run,
-    summarize,
-)
+from terrain.estimation.estimate import THESIS_EMA_ALPHA, Estimate, enriched, estimate_run, summarize
 from terrain.estimation.feed import measurement_table
-from terrain.estimation.filter import FilterSettings, Noise, run_filter
-from terrain.estimation.models.swerve import default_noise, make_filter, thesis_noise
+from terrain.estimation.filter import FilterModel, FilterSettings, differentiate, run_filter
+from terrain.estimation.models.swerve import THESIS_SAMPLE_TIME_S, make_filter
 from terrain.estimation.wheel_slip import STEADY_SPEED_MPS, slip_figures, wheel_slip
+from terrain.kernels import njit
 from terrain.kinematics.camera import body_motion, odometry_stream, to_camera
 from terrain.kinematics.commands import scaled
 from terrain.kinematics.wheels import no_slip_twist, wheel_velocities
@@ -87,15 +82,18 @@ def estimate_with_both_filters(runs: Sequence[RunLog]) -> tuple[list[Estimate], 
 
 
 def by_filter(runs: Sequence[RunLog], name: str, tuning: str = "thesis") -> list[Estimate]:
-    """Return the estimates of a filter."""
-    return [estimate_run(run, load_robot(ROBOT), name, tuning=tuning) for run in runs]
+    """Return the estimates of a filter; ``slip14`` is that of :func:`slip_ratio_filter`."""
+    robot = load_robot(ROBOT)
+    if name == "slip14":
+        model = slip_ratio_filter(robot)
+        return [estimate_run(run, robot, "encoder12", tuning=tuning, model=model) for run in runs]
+    return [estimate_run(run, robot, name, tuning=tuning) for run in runs]
 
 
 def lagged_truth(run: RunLog, robot: Robot) -> Curve:
     """Return the true slip after the low-pass filter of the encoders: the best that can be estimated."""
-    truth = run.streams["truth"]
-    slip, ground_speed = lagged_slip(truth, robot, robot.equipment.sensors.encoder_time_constant_s)
-    return Curve(truth.time_s, slip, ground_speed.mean(axis=1))
+    slip, ground_speed = lagged_slip(run, robot)
+    return Curve(run.streams["truth"].time_s, slip, ground_speed.mean(axis=1))
 
 
 def true_slip(estimate: Estimate) -> Array:
@@ -284,6 +282,51 @@ def _slip_states(estimate: Estimate) -> Array:
     return np.column_stack([estimate.track.state(f"slip_{wheel}_ratio") for wheel in estimate.robot.wheels])
 
 
+LARGEST_SLIP_RATIO = 0.95
+"""The wheel rows have a pole at 1: they are evaluated no nearer."""
+
+
+@njit
+def _measure_slip14(x: Array, _dt: float, params: Array, z: Array) -> None:
+    for i in range(3):
+        place_x, place_y = params[1 + 2 * i], params[2 + 2 * i]
+        rolls = 1.0 - min(x[8 + i], LARGEST_SLIP_RATIO)
+        ahead, left = x[3] - x[5] * place_y, x[4] + x[5] * place_x
+        z[i] = (ahead * np.cos(x[11 + i]) + left * np.sin(x[11 + i])) / (params[0] * rolls)
+        z[7 + i] = x[11 + i]
+    z[3], z[4], z[5], z[6] = x[6], x[7], x[5], x[2]
+
+
+@njit
+def _observe_slip14(x: Array, params: Array, z_hat: Array, h: Array) -> None:
+    differentiate(_measure_slip14, x, 0.0, params, z_hat, h)
+
+
+def slip_ratio_filter(robot: Robot) -> FilterModel:
+    """Return the thesis' filter with 14 states: a slip ratio of each wheel, and no bias of the gyro.
+
+    As encoder12 beside that, with ``wheel_i = v_i / ((1 - s_i) r)`` and the noise of (4.38) to (4.41).  Nothing
+    determines the slip ratios as long as it drives straight.
+    """
+    plain, n = make_filter("encoder12", robot, thesis=True), 8
+    states = (*plain.states[:n], *(f"slip_{wheel}_ratio" for wheel in robot.wheels), *plain.states[n : n + 3])
+    steer_walk = plain.process_variance.diagonal()[n]
+    return replace(
+        plain,
+        name="slip14",
+        states=states,
+        observe=_observe_slip14,
+        process_variance=[
+            *plain.process_variance.diagonal()[:n],
+            *[1e-5 / THESIS_SAMPLE_TIME_S] * 3,
+            *[steer_walk] * 3,
+        ],
+        initial_variance=[*plain.initial_variance.diagonal()[:n], *[1e-6] * 3, *[1e-1] * 3],
+        initial_mean=np.zeros(len(states)),
+        angle_states=tuple(state for state in states if state in plain.angle_states),
+    )
+
+
 def straight_line_rank(name: str, robot: Robot, as_printed: bool = False) -> tuple[int, int]:
     """Return how many independent states of a filter are observable driving straight, of all but the position.
 
@@ -302,7 +345,7 @@ def straight_line_rank(name: str, robot: Robot, as_printed: bool = False) -> tup
     >>> straight_line_rank("slip14", load_robot("agrimaro"), as_printed=True)
     (9, 12)
     """
-    model = make_filter(name, robot)
+    model = slip_ratio_filter(robot) if name == "slip14" else make_filter(name, robot)
     n = len(model.states)
     x, params = np.zeros(n), np.append(model.params, np.zeros(len(model.inputs)))
     along, across, yaw_rate = map(model.states.index, ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"))
@@ -331,20 +374,20 @@ WHEEL_SPEED_MPS = 1.0
 """Commanded wheel speed of the scenario ``straight``."""
 
 
-def adaptive_noise(robot: Robot, factor: float) -> Noise:
-    """Return noise for encoder12 that trusts the wheels less and the IMU more, as thesis 4.6.1 tried in vain.
+def adaptive_noise(robot: Robot, factor: float) -> FilterModel:
+    """Return encoder12 with noise that trusts the wheels less and the IMU more, as thesis 4.6.1 tried in vain.
 
     The variance of the wheels is multiplied by the factor, that of accelerometer and gyro divided by it, and
     the walk of the yaw rate multiplied.  No factor will do: as long as the wheels hold the speed, it is
     theirs and slip reads zero; where they do not, it includes the integral of the accelerometer's
     bias.  The speed over ground has to be measured.
     """
-    model, plain = make_filter("encoder12", robot), default_noise("encoder12", robot)
+    plain = make_filter("encoder12", robot)
     scale = {"wheel": factor, "accel": 1 / factor, "gyro": 1 / factor}
     walk = plain.process_variance.diagonal().copy()
-    walk[model.states.index("yaw_rate_radps")] *= factor
-    scales = [scale.get(row.split("_")[0], 1.0) for row in model.rows]
-    return Noise(walk, plain.measurement_variance * np.array(scales), plain.initial_variance)
+    walk[plain.states.index("yaw_rate_radps")] *= factor
+    scales = np.array([scale.get(row.split("_")[0], 1.0) for row in plain.rows])
+    return replace(plain, process_variance=walk, measurement_variance=plain.measurement_variance * scales)
 
 
 def adaptive_tuning(trial: Trial) -> Finding:
@@ -353,7 +396,7 @@ def adaptive_tuning(trial: Trial) -> Finding:
     runs = seeded_runs(trial, "grass", "straight", duration_s=length_s)
     estimates = {
         factor: [
-            estimate_run(run, robot, "encoder12", tuning="thesis", noise=adaptive_noise(robot, factor))
+            estimate_run(run, robot, "encoder12", tuning="thesis", model=adaptive_noise(robot, factor))
             for run in runs
         ]
         for factor in FACTORS
@@ -447,10 +490,10 @@ def dead_band(trial: Trial) -> Finding:
 
 def innovations(trial: Trial) -> Finding:
     """Compare the variances of the innovations with the thesis' figures, with R, and with those expected."""
-    robot = load_robot(ROBOT)
     runs = seeded_runs(trial, "tiles", "complex", duration_s=40.0 if trial.quick else None)
-    estimates, noise = by_filter(runs, "vio12"), thesis_noise("vio12", robot)
-    variance_r = dict(zip(estimates[0].model.rows, noise.measurement_variance.tolist(), strict=True))
+    estimates = by_filter(runs, "vio12")
+    model = estimates[0].model
+    variance_r = dict(zip(model.rows, model.measurement_variance.tolist(), strict=True))
     found, over_r = [], {}
     for claim in trial.each["variance"]:
         row = claim["row"]
@@ -467,7 +510,7 @@ def innovations(trial: Trial) -> Finding:
         [summarize(one).nis["camera_speed"] for one in each]
         for each in (estimates, by_filter(runs, "vio15", "physical"))
     )
-    q_mps = float(np.sqrt(noise.process_variance[3, 3] * THESIS_SAMPLE_TIME_S))
+    q_mps = float(np.sqrt(model.process_variance[3, 3] * THESIS_SAMPLE_TIME_S))
     numbers = {
         "variance": found,
         "largest_over_r": Numbers(max(over_r.values()), beside=over_r),
@@ -570,10 +613,9 @@ def _slip_with(
 ) -> Curve:
     """Return the slip by the thesis' filter, without gating, from signals with this smoothing."""
     table = measurement_table(run, robot, time_constant_s=time_constant_s, ema_alpha=ema_alpha)
-    model = make_filter("vio12", robot)
-    noise = thesis_noise("vio12", robot, THESIS_SAMPLE_TIME_S)
+    model = make_filter("vio12", robot, thesis=True)
     ungated = FilterSettings(gate_probability=1.0)
-    track = run_filter(model, noise, table.time_s, table.columns(model.rows), ungated)
+    track = run_filter(model, table.time_s, table.columns(model.rows), ungated)
     slip = wheel_slip(track, table.at(track.time_s), robot)
     return Curve(track.time_s, slip.slip_ratio, track.state("speed_x_mps"))
 

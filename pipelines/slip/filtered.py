@@ -64,17 +64,17 @@ def estimate_all(
     name, tuning = options.filter, tuning_of(options.filter, options.tuning)
     if options.tune_on is not None and tuning != "likelihood":
         raise ConfigError(f"runs to tune on go with the tuning 'likelihood', not {tuning!r}")
-    noise, tuned = None, None
+    variance, tuned = None, None
     if tuning == "likelihood":
         from terrain.estimation.tuning import tuned_noise
 
-        noise, tuned = tuned_noise(runs, robot, name, options.tune_on)
+        variance, tuned = tuned_noise(runs, robot, name, options.tune_on)
 
     def robot_of(run: RunLog) -> Robot:
         return robot or packaged_robot(run.robot)
 
     def estimate(run: RunLog) -> tuple[Any, RunLog, Pictures]:
-        found = estimate_run(run, robot_of(run), name, tuning=tuning, tuned=noise)
+        found = estimate_run(run, robot_of(run), name, tuning=tuning, process_variance=variance)
         return summarize(found), enriched(found), partial(figures_of, found)
 
     found = estimate_each(runs, name, estimate, progress, keep)

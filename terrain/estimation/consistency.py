@@ -22,7 +22,7 @@ from scipy.special import chdtri
 
 from terrain.angles import wrapped
 from terrain.errors import DataError
-from terrain.estimation.filter import Filter, FilterModel, FilterSettings, Noise
+from terrain.estimation.filter import DEFAULT_SETTINGS, FilterModel
 from terrain.kinematics.logged_wheels import true_slip, wheel_and_ground_speed
 from terrain.records import GATED, USED, Array, RunLog, StateTrack, Stream
 from terrain.robots import Robot
@@ -45,40 +45,28 @@ class ConsistencyVerdict(StrEnum):
 
 
 class Consistency(NamedTuple):
-    """How the errors of one sensor, or of one group of states, agree with the covariance of the filter.
-
-    ``n_independent`` is the effective number of independent values among the n.
-    """
+    """How the errors of one sensor, or of one group of states, agree with the covariance of the filter."""
 
     name: str
     n: int
-    n_independent: float
+    n_independent: float  #: the effective number of independent values among the n
     mean_per_dof: float
-    low: float
-    high: float
     gated_fraction: float
     verdict: ConsistencyVerdict
 
 
-class ConsistencyReport(NamedTuple):
-    """NIS of each sensor, and NEES of each group of states of which the truth is known."""
-
-    sensors: tuple[Consistency, ...]
-    states: tuple[Consistency, ...]
-
-
-def consistency_report(track: StateTrack, truth: Array | None = None) -> ConsistencyReport:
+def consistency_report(track: StateTrack, truth: Array | None = None) -> dict[str, tuple[Consistency, ...]]:
     """Judge a track by its innovations, and by the truth (n, d) of its states where there is one, NaN where unknown.
 
+    Returns the NIS of each of the ``sensors``, and the NEES of each group of ``states`` of which the truth is known.
     The mean per degree of freedom is judged by the two-sided 95 % bounds for as many independent values as there are.
     States are grouped as their names are (``speed`` has x and y), and all that are known together are ``all``.
     ``DataError`` where the shape of the truth does not fit.
     """
     sensors, states = [], []
     for k, name in enumerate(track.sensors):
-        used, gated = track.use[:, k] == USED, track.use[:, k] == GATED
-        came = int(used.sum() + gated.sum())
-        gated_fraction = float(gated.sum() / came) if came else 0.0
+        used, gated = track.use[:, k] == USED, int((track.use[:, k] == GATED).sum())
+        gated_fraction = gated / max(int(used.sum()) + gated, 1)
         sensors.append(_judge(name, track.nis[used, k], track.nis_dof[used, k], gated_fraction))
     if truth is not None:
         values = _fitting(truth, track, track.states)
@@ -92,7 +80,7 @@ def consistency_report(track: StateTrack, truth: Array | None = None) -> Consist
             squares = nees(track, values[:, [track.states.index(state) for state in members]], members)
             squares = squares[np.isfinite(squares)]
             states.append(_judge(name, squares, np.full(squares.size, len(members)), 0.0))
-    return ConsistencyReport(tuple(sensors), tuple(states))
+    return {"sensors": tuple(sensors), "states": tuple(states)}
 
 
 def nees(track: StateTrack, truth: Array, states: Sequence[str] | None = None) -> Array:
@@ -104,14 +92,12 @@ def nees(track: StateTrack, truth: Array, states: Sequence[str] | None = None) -
     states = track.states if states is None else tuple(states)
     for unknown in (state for state in states if state not in track.states):
         raise DataError(f"the track has no state {unknown!r}: it has {', '.join(track.states)}")
-    values = _fitting(truth, track, states)
     index = [track.states.index(state) for state in states]
-    error = track.mean[:, index] - values
+    error = track.mean[:, index] - _fitting(truth, track, states)
     angles = [i for i, state in enumerate(states) if state.endswith("_rad")]
     error[:, angles] = wrapped(error[:, angles])
     solved = np.linalg.solve(track.cov[:, index][:, :, index], error[..., None])[..., 0]
-    squares: Array = np.einsum("ni,ni->n", error, solved)
-    return squares
+    return np.asarray(np.einsum("ni,ni->n", error, solved))
 
 
 def _fitting(truth: Array, track: StateTrack, states: Sequence[str]) -> Array:
@@ -122,97 +108,64 @@ def _fitting(truth: Array, track: StateTrack, states: Sequence[str]) -> Array:
 
 
 def _judge(name: str, squares: Array, dof: Array, gated_fraction: float) -> Consistency:
-    """Compare squares (n,), each of so many degrees of freedom, with chi-square."""
-    verdict = ConsistencyVerdict.OVERCONFIDENT if gated_fraction else ConsistencyVerdict.UNKNOWN
-    if not squares.size:
-        return Consistency(name, 0, 0.0, np.nan, np.nan, np.nan, gated_fraction, verdict)
-    dof = dof.astype(np.float64)
-    n_independent = _independent(squares / dof)
-    total = n_independent * dof.mean()
+    """Compare squares (n,), each of so many degrees of freedom, with chi-square.
+
+    As many independent values say as much on the mean as n over the autocorrelation time.
+    """
+    n = squares.size
+    if not n:
+        verdict = ConsistencyVerdict.OVERCONFIDENT if gated_fraction else ConsistencyVerdict.UNKNOWN
+        return Consistency(name, 0, 0.0, np.nan, gated_fraction, verdict)
+    values, n_independent = squares / dof, float(n)
+    spectrum = np.fft.rfft(values - values.mean(), 2 * n)
+    correlation = np.fft.irfft(spectrum * spectrum.conj())[:n]
+    if correlation[0] > 0:
+        rho = correlation / correlation[0]
+        negative = np.flatnonzero(rho <= 0)
+        end = int(negative[0]) if negative.size else n
+        n_independent = float(n / max(1.0, 1 + 2 * rho[1:end].sum()))
+    total, mean = n_independent * dof.mean(), float(squares.sum() / dof.sum())
     low, high = (float(chdtri(total, p)) / total for p in (1 - OUTSIDE / 2, OUTSIDE / 2))
-    mean = float(squares.sum() / dof.sum())
     verdict = ConsistencyVerdict.CONSERVATIVE if mean < low else ConsistencyVerdict.CONSISTENT
     if mean > high or gated_fraction > MOST_GATED:
         verdict = ConsistencyVerdict.OVERCONFIDENT
-    return Consistency(name, squares.size, n_independent, mean, low, high, gated_fraction, verdict)
-
-
-def _independent(values: Array) -> float:
-    """Return how many independent values say as much on the mean: n over the autocorrelation time."""
-    n = values.size
-    spectrum = np.fft.rfft(values - values.mean(), 2 * n)
-    correlation = np.fft.irfft(spectrum * spectrum.conj())[:n]
-    if correlation[0] <= 0:
-        return float(n)
-    rho = correlation / correlation[0]
-    negative = np.flatnonzero(rho <= 0)
-    end = int(negative[0]) if negative.size else n
-    return float(n / max(1.0, 1 + 2 * rho[1:end].sum()))
+    return Consistency(name, n, n_independent, mean, gated_fraction, verdict)
 
 
 def innovations(
     model: FilterModel,
-    noise: Noise,
     track: StateTrack,
     z: Array,
-    max_gap_s: float = FilterSettings.max_gap_s,
+    variance: Array | None = None,
+    walk: Array | None = None,
     inputs: Array | None = None,
 ) -> dict[str, tuple[Array, Array]]:
     """Return by row the innovation (n,) at each instant, and the standard deviation that was expected of it.
 
     That is ``z - h(x)`` and ``sqrt(diag(H P H' + R))`` with what is predicted from the instant before; NaN where
-    nothing was measured, at the first instant and after a gap.  Noise, measurements (n, m) and inputs (n, k) are those
-    at the instants of the track.
+    nothing was measured, at the first instant and after a gap.  Measurements (n, m), and what changes from sample to
+    sample as of :func:`~terrain.estimation.filter.run_filter`, are those at the instants of the track.
     """
     n, d, m = len(track.time_s), len(model.states), len(model.rows)
     value, std = np.full((2, n, m), np.nan)
-    variance = np.broadcast_to(noise.measurement_variance, (n, m))
-    known = np.zeros((n, len(model.inputs))) if inputs is None else inputs
-    walk = np.zeros((n, d)) if noise.walk_variance is None else noise.walk_variance
-    x_next, z_hat = np.zeros(d), np.zeros(m)
+    variance = np.broadcast_to(model.measurement_variance if variance is None else variance, (n, m))
+    x_next, z_hat, nothing = np.zeros(d), np.zeros(m), np.zeros(len(model.inputs))
     for k in range(1, n):
         dt_s = track.time_s[k] - track.time_s[k - 1]
-        if dt_s > max_gap_s:
+        if dt_s > DEFAULT_SETTINGS.max_gap_s:
             continue
-        f, h, params = np.zeros((d, d)), np.zeros((m, d)), np.append(model.params, known[k])
+        f, h = np.zeros((d, d)), np.zeros((m, d))
+        params = np.append(model.params, nothing if inputs is None else inputs[k])
         model.propagate(np.array(track.mean[k - 1]), dt_s, params, x_next, f)
         model.observe(x_next, params, z_hat, h)
-        predicted = f @ track.cov[k - 1] @ f.T + (noise.process_variance + np.diag(walk[k])) * dt_s
+        process = model.process_variance + np.diag(np.zeros(d) if walk is None else walk[k])
+        predicted = f @ track.cov[k - 1] @ f.T + process * dt_s
         value[k] = z[k] - z_hat
         std[k] = np.sqrt(np.einsum("ij,jk,ik->i", h, predicted, h) + variance[k])
-    is_angle = [row in model.angle_rows for row in model.rows]
+    is_angle = np.isin(model.rows, model.angle_rows)
     value[:, is_angle] = wrapped(value[:, is_angle])
     std[np.isnan(value)] = np.nan
     return {row: (value[:, i], std[:, i]) for i, row in enumerate(model.rows)}
-
-
-def sample_from_model(
-    model: FilterModel, noise: Noise, n: int, dt_s: float, rng: np.random.Generator
-) -> tuple[Array, Array, Array]:
-    """Draw a truth and its measurements from a filter's own equations: on these it has to be consistent.
-
-    Returns ``time_s (n,), truth (n, d), z (n, m)``; the truth starts from the initial mean and variance.
-    """
-    d, m = len(model.states), len(model.rows)
-    start = Filter(model, noise)
-    x = start.mean + np.linalg.cholesky(start.cov) @ rng.standard_normal(d)
-    values, vectors = np.linalg.eigh(noise.process_variance * dt_s)
-    walk = rng.standard_normal((n, d)) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
-    z = rng.standard_normal((n, m)) * np.sqrt(noise.measurement_variance)
-    is_angle_state = np.array([name in model.angle_states for name in model.states])
-    is_angle_row = np.array([name in model.angle_rows for name in model.rows])
-    params = np.append(model.params, np.zeros(len(model.inputs)))
-    truth, x_next, z_hat = np.empty((n, d)), np.zeros(d), np.zeros(m)
-    for k in range(n):
-        if k > 0:
-            model.propagate(x, dt_s, params, x_next, np.zeros((d, d)))
-            x = x_next + walk[k]
-            x[is_angle_state] = wrapped(x[is_angle_state])
-        truth[k] = x
-        model.observe(x, params, z_hat, np.zeros((m, d)))
-        z[k] += z_hat
-    z[:, is_angle_row] = wrapped(z[:, is_angle_row])
-    return np.arange(n) * dt_s, truth, z
 
 
 def true_states(
@@ -251,33 +204,34 @@ def _true_state(truth: Stream, state: str, robot: Robot, initial_yaw_rad: float)
         bias = truth.channel("gyro_bias_z_radps") - robot.completed.sensors.gyro_bias_z_radps
         return np.asarray(bias if "bias" in state else cumulative_trapezoid(bias, truth.time_s, initial=0.0))
     if state.startswith("slip_speed_"):
-        wheel_speed, along = wheel_and_ground_speed(truth, robot)
         wheel = state.split("_")[2]
         if wheel not in robot.wheels:
             raise DataError(f"state {state!r} is of a wheel that robot {robot.name} does not have")
+        wheel_speed, along = wheel_and_ground_speed(truth, robot)
         return np.asarray((wheel_speed - along)[:, robot.wheels.index(wheel)])
     return None
 
 
-def lagged_slip(truth: Stream, robot: Robot, time_constant_s: float) -> tuple[Array, Array]:
-    """Return the true slip ratio and speed over ground of each wheel, both (n, wheels), behind a low-pass.
+def lagged_slip(run: RunLog, robot: Robot) -> tuple[Array, Array]:
+    """Return the true slip ratio and speed over ground of each wheel, both (n, wheels), on the truth's clock.
 
-    Of slip between speeds that come behind it, this is the best that can be estimated.
+    Behind the low-pass of the encoders: of slip between speeds that come behind it, this is the best that can be
+    estimated.
     """
-    wheel_speed, ground = (
-        np.column_stack(
-            [low_passed(truth.time_s, wheel, time_constant_s, LONGEST_STEP_S) for wheel in speeds.T]
-        )
-        for speeds in wheel_and_ground_speed(truth, robot)
-    )
+    truth = run.streams["truth"]
+
+    def behind(speeds: Array) -> Array:
+        wheels = (low_passed(truth.time_s, wheel, robot.encoder_lag_s, LONGEST_STEP_S) for wheel in speeds.T)
+        return np.column_stack(list(wheels))
+
+    wheel_speed, ground = map(behind, wheel_and_ground_speed(truth, robot))
     return slip_ratio(wheel_speed, ground), ground
 
 
 def lagged_slip_at(run: RunLog, robot: Robot, time_s: Array) -> Array:
-    """Return :func:`lagged_slip` (n, wheels) of a run behind its encoders' low-pass, at some instants."""
-    truth = run.streams["truth"]
-    slip, _ = lagged_slip(truth, robot, robot.encoder_lag_s)
-    return np.column_stack([np.interp(time_s, truth.time_s, wheel) for wheel in slip.T])
+    """Return the true slip ratio of :func:`lagged_slip` (n, wheels) at some instants."""
+    slip, _ = lagged_slip(run, robot)
+    return np.column_stack([np.interp(time_s, run.streams["truth"].time_s, wheel) for wheel in slip.T])
 
 
 def true_slip_at(run: RunLog, robot: Robot, time_s: Array) -> Array:

@@ -16,7 +16,6 @@ from terrain.estimation.filter import (
     REOPEN_AFTER_S,
     FilterModel,
     FilterSettings,
-    Noise,
     run_filter,
 )
 from terrain.estimation.models import swerve
@@ -27,11 +26,10 @@ from terrain.estimation.models.skid import (
     make_skid_filter,
     motion_seconds,
     motion_track,
-    skid_noise,
     stuck_intervals,
     within_bounds,
 )
-from terrain.estimation.wheel_slip import SlipFigures, blind_slip, slip_figures, wheel_slip
+from terrain.estimation.wheel_slip import SlipFigures, slip_figures, wheel_slip
 from terrain.extension import check_corrected, correct
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.schema import ESTIMATOR_CHANNELS
@@ -52,8 +50,6 @@ FILTERS_OF_DRIVE: Mapping[str, tuple[str, ...]] = {
 TUNINGS = ("physical", "thesis", "likelihood")
 #: Tuning unless another is chosen: vio12 is the thesis' own filter, all others are physical.
 OWN_TUNING: Mapping[str, str] = {"vio12": "thesis"}
-#: Q of the thesis is per step; the sample time, which it does not print, is that of the wheels stream.
-THESIS_SAMPLE_TIME_S = 0.02
 THESIS_EMA_ALPHA = 0.2  #: Thesis (7.8): smoothing of the camera.
 #: States whose error is judged (NEES): those that slip is computed from.
 JUDGED_STATES = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "slip_speed_")
@@ -66,8 +62,9 @@ class Estimate:
     run: RunLog  #: the log, as measured
     robot: Robot  #: whose log it is, as the filter models it: without the effects of an extended one
     name: str  #: of the filter
-    model: FilterModel  #: the filter, and of its process and its measurements
-    noise: Noise
+    model: FilterModel  #: the filter
+    #: what changes from instant to instant: variances (n, m), walks (n, d) and inputs (n, k), None where they do not
+    scheduled: tuple[Array | None, ...]
     table: MeasurementTable  #: its measurements, of the log without the robot's effects
     track: StateTrack  #: its states
     slip: SlipTrack  #: NaN where the speed over ground is not observed
@@ -81,9 +78,7 @@ class Estimate:
     @property
     def innovations(self) -> dict[str, tuple[Array, Array]]:
         """By row the measurement minus the prediction at each instant (n,), and its expected standard deviation."""
-        inputs = np.nan_to_num(self.table.columns(self.model.inputs))
-        z = self.table.columns(self.model.rows)
-        return innovations(self.model, self.noise, self.track, z, inputs=inputs)
+        return innovations(self.model, self.track, self.table.columns(self.model.rows), *self.scheduled)
 
     @property
     def motion(self) -> Array | None:
@@ -101,9 +96,9 @@ def estimate_run(
     name: str,
     *,
     tuning: str | None = None,
-    noise: Noise | None = None,
     initial_yaw_rad: float | None = None,
-    tuned: Noise | None = None,
+    process_variance: Array | None = None,
+    model: FilterModel | None = None,
 ) -> Estimate:
     """Correct one run for the effects of its robot, and filter it.
 
@@ -112,10 +107,10 @@ def estimate_run(
     run, robot : log of the robot, as measured, and its description; or both corrected
     name : one of :data:`FILTERS`
     tuning : one of :data:`TUNINGS`; the filter's own (:data:`OWN_TUNING`) by default
-    noise : any, in place of that of the tuning
     initial_yaw_rad : heading at the start in the frame of the GNSS, east 0; found from the drive by default,
         and where the drive does not determine it the GNSS is left out and counted
-    tuned : noise of other runs, which may have other sensors; only its process variance is taken
+    process_variance : that of a tuning on chosen runs, which may have other sensors, in place of the physical
+    model : with noise of its own, in place of the filter of that name
 
     Returns
     -------
@@ -130,9 +125,10 @@ def estimate_run(
     """
     log, driven = correct(run, robot)
     tuning = tuning_of(name, tuning)
-    model, usual = model_and_noise(log, driven, name, tuning)
-    if tuned is not None:
-        noise = replace(usual, process_variance=tuned.process_variance)
+    is_physical = tuning == "physical" and process_variance is None and model is None
+    model = model or model_of(log, driven, name, tuning)
+    if process_variance is not None:
+        model = replace(model, process_variance=process_variance)
     has_gnss, yaw_rad = GNSS_ROWS[0] in model.rows, initial_yaw_rad or 0.0
     ema_alpha = THESIS_EMA_ALPHA if tuning == "thesis" and name == "vio12" else None
     table = measurement_table(log, driven, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
@@ -142,40 +138,34 @@ def estimate_run(
             streams = dict(run.streams)
             unused = {"gnss: heading not observable in this run": len(streams.pop("gnss"))}
             without = replace(run, streams=streams)
-            found = estimate_run(without, robot, name, tuning=tuning, initial_yaw_rad=0.0, tuned=tuned)
+            found = estimate_run(
+                without, robot, name, tuning=tuning, initial_yaw_rad=0.0, process_variance=process_variance
+            )
             return replace(found, table=replace(found.table, dropped={**found.table.dropped, **unused}))
         table = measurement_table(log, driven, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
-    is_scheduled, noise, inputs = noise is None and tuning == "physical", noise or usual, None
-    if has_gnss:  # each position has the variance of its own fix
-        variance, first = (
-            np.tile(noise.measurement_variance, (len(table.time_s), 1)),
-            model.rows.index(GNSS_ROWS[0]),
-        )
-        variance[:, first : first + len(GNSS_ROWS)] = table.gnss_variance
-        noise = Noise(noise.process_variance, variance, noise.initial_variance)
-    if is_scheduled:
-        noise, inputs = swerve.scheduled(model, noise, table)
+    samples = swerve.scheduled(model, table.z, table.gnss_variance, is_physical)
     settings = FilterSettings(1.0 if tuning == "thesis" else GATE_PROBABILITY, REOPEN_AFTER_S)
-    track = run_filter(model, noise, table.time_s, table.columns(model.rows), settings, inputs)
+    track = run_filter(model, table.time_s, table.columns(model.rows), settings, *samples)
     if name == "skid":
         track = replace(track, mean=within_bounds(track.mean, driven.track_m))
         speed_mps = track.state("speed_mps")
     else:
         speed_mps = np.hypot(track.state("speed_x_mps"), track.state("speed_y_mps"))
-    noise = noise.at(np.searchsorted(table.time_s, track.time_s))
+    kept = np.searchsorted(table.time_s, track.time_s)
+    scheduled = tuple(None if part is None else part[kept] for part in samples)
     table = table.at(track.time_s)
-    slip, blind = wheel_slip(track, table, driven), blind_slip(track, table, driven)
+    slip, blind = wheel_slip(track, table, driven), wheel_slip(track, table, driven, blind=True)
     rolling = np.where(table.columns(driven.wheel_rows) < 0.0, -1.0, 1.0)
     observable = bool(np.isfinite(slip.slip_ratio).any())
     figures = slip_figures(slip if observable else blind, speed_mps, track.time_s, rolling)
     truth = true_states(log, track, driven, driven.encoder_lag_s, yaw_rad)
-    return Estimate(run, driven, name, model, noise, table, track, slip, blind, figures, truth, observable)
+    return Estimate(
+        run, driven, name, model, scheduled, table, track, slip, blind, figures, truth, observable
+    )
 
 
-def model_and_noise(
-    run: RunLog, robot: Robot, name: str, tuning: str | None = None
-) -> tuple[FilterModel, Noise]:
-    """Return the filter for a corrected run, and the noise that it starts from; errors as :func:`estimate_run`."""
+def model_of(run: RunLog, robot: Robot, name: str, tuning: str | None = None) -> FilterModel:
+    """Return the filter for a corrected run, with the noise that it starts from; errors as :func:`estimate_run`."""
     check_corrected(robot)
     of_drive, chosen = FILTERS_OF_DRIVE[robot.drive], robot.filters
     if name in FILTERS and (name not in of_drive or (chosen and name not in chosen)):
@@ -187,11 +177,10 @@ def model_and_noise(
             f"filter {name!r} is not for robot {robot.name}, whose drive is {robot.drive}: use {fits}"
         )
     if name == "skid":
-        return make_skid_filter(robot), skid_noise(robot)
-    if tuning_of(name, tuning) == "thesis":
-        return swerve.make_filter(name, robot), swerve.thesis_noise(name, robot, THESIS_SAMPLE_TIME_S)
-    gnss = "gnss" in run.streams and len(run.streams["gnss"]) > 0
-    return swerve.make_filter(name, robot, with_gnss=gnss), swerve.default_noise(name, robot, gnss)
+        return make_skid_filter(robot)
+    is_thesis = tuning_of(name, tuning) == "thesis"
+    has_gnss = not is_thesis and "gnss" in run.streams and len(run.streams["gnss"]) > 0
+    return swerve.make_filter(name, robot, has_gnss, is_thesis)
 
 
 def tuning_of(name: str, tuning: str | None) -> str:
@@ -295,7 +284,7 @@ def summarize(estimate: Estimate) -> EstimateSummary:
     for k, sensor in enumerate(track.sensors):
         if dof := int(track.nis_dof[used[:, k], k].sum()):
             nis[sensor] = float(np.nansum(track.nis[used[:, k], k]) / dof)
-    for kind, entries in consistency_report(track, truth)._asdict().items():
+    for kind, entries in consistency_report(track, truth).items():
         for entry in entries:
             consistency[kind][entry.name] = entry.verdict
     dropped = {**estimate.table.dropped, **track.dropped}

@@ -46,14 +46,11 @@ REOPEN_AFTER_S = 0.2
 HELD_S = 2.0  #: A sensor that the model holds is not reopened before this time.
 #: No state or measurement of a ground robot in SI units comes near: what does is taken for garbage.
 LARGEST = 1e9
-
 WIDEST = LARGEST**4
-
 #: After a longer gap a position is no less certain than after this one: that is nowhere already.
 LONGEST_GAP_S = 3600.0
 #: Room in the records for states, rows and sensors: every filter is one type for the compiled step.
 MOST = 32
-
 _SLACK_S = 1e-9  # what sums of steps may be off by
 
 _VECTOR, _MATRIX = float64[::1], float64[:, ::1]
@@ -65,13 +62,13 @@ _SIGNATURES = {
 
 @dataclass(frozen=True, eq=False)
 class FilterModel:
-    """What a filter estimates, and from what.
+    """What a filter estimates, from what, and how much either is off.
 
     Raises
     ------
     ConfigError
-        where a name has no unit, is given twice or refers to nothing, a length does not fit, or a function is
-        none of numba.
+        where a name has no unit, is given twice or refers to nothing, an array does not fit or is no variance, or a
+        function is none of numba.
     """
 
     name: str  #: what reports call it
@@ -87,7 +84,11 @@ class FilterModel:
     #: zero.  Both are functions of numba, ``@njit``
     observe: Any
     params: Array  #: what the two functions need of the robot; the inputs of a sample stand behind them
-    initial_std: Array  #: (d,) how little is known of each state where nothing is known
+    #: variances in squared natural units, as ``0.02**2``: (d,) or (d, d) **per second**, a step of dt adds Q dt;
+    #: (m,) of each row, rows are independent; (d,) or (d, d) of the state where nothing is known
+    process_variance: Array
+    measurement_variance: Array
+    initial_variance: Array
     initial_mean: Array = field(default_factory=lambda: np.zeros(0))  #: (d,) zeros without
     #: names of what is known of each step beside the state; 0 where it is not given
     inputs: tuple[str, ...] = ()
@@ -100,18 +101,49 @@ class FilterModel:
     angle_rows: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        place, shape = f"filter {self.name}", (len(self.states),)
+        place, d, m = f"filter {self.name}", len(self.states), len(self.rows)
+        for name in (*self.states, *self.rows):
+            try:
+                unit_of(name)
+            except LogError as error:
+                raise ConfigError(f"{place}: {str(error).replace('channel', 'state or row')}") from None
+        for what, names in (("states", self.states), ("rows", self.rows), ("sensors", self.sensor_names)):
+            if len(set(names)) < len(names) or len(names) > MOST:
+                raise ConfigError(f"{place}: {what} {list(names)} have one twice, or are more than {MOST}")
+        grouped = [row for _, rows in self.sensors for row in rows]
+        if sorted(grouped) != sorted(self.rows):
+            raise ConfigError(f"{place}: its sensors must hold every row once; they hold {grouped}")
+        for what, known in (
+            *dict.fromkeys(("references", "held"), self.sensor_names).items(),
+            *dict.fromkeys(("positions", "angle_states"), self.states).items(),
+            ("angle_rows", self.rows),
+        ):
+            if unknown := set(getattr(self, what)) - set(known):
+                raise ConfigError(f"{place}: {what} name {unknown}, none of {', '.join(known)}")
         if not len(self.initial_mean):
-            object.__setattr__(self, "initial_mean", np.zeros(shape))
-        for name in ("params", "initial_std", "initial_mean"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
-            if name != "params" and getattr(self, name).shape != shape:
-                raise ConfigError(f"{place}: {name} has shape {getattr(self, name).shape}, {shape} is needed")
-        if not (np.isfinite(self.initial_std).all() and (self.initial_std > 0).all()):
-            raise ConfigError(
-                f"{place}: initial_std {self.initial_std.tolist()} must be above zero and finite"
-            )
-        self._check_names(place)
+            object.__setattr__(self, "initial_mean", np.zeros(d))
+        for what, shape in (
+            ("params", None),
+            ("initial_mean", (d,)),
+            ("measurement_variance", (m,)),
+            ("process_variance", (d, d)),
+            ("initial_variance", (d, d)),
+        ):
+            array = np.asarray(getattr(self, what), dtype=np.float64)
+            if shape == (d, d) and array.ndim == 1:
+                array = np.diag(array)
+            if array.shape != (shape or array.shape) or not np.isfinite(array).all():
+                raise ConfigError(f"{place}: {what} has shape {array.shape}, finite {shape} is needed")
+            if shape == (d, d):
+                array, scale = (array + array.T) / 2, np.abs(array).max()
+                least = np.linalg.eigvalsh(array)[0]
+                if least < -1e-12 * scale or (least <= 0 and what == "initial_variance"):
+                    raise ConfigError(
+                        f"{place}: {what} is no covariance: its least eigenvalue is {least:.3g}"
+                    )
+            object.__setattr__(self, what, read_only(array))
+        if not (self.measurement_variance > 0).all():
+            raise ConfigError(f"{place}: measurement_variance must be above zero")
         for name, signature in _SIGNATURES.items():
             function = getattr(self, name)
             if tuple(signature.args) not in getattr(function, "signatures", ()):
@@ -120,110 +152,14 @@ class FilterModel:
                 except (AttributeError, RuntimeError, TypeError, NumbaError):
                     raise ConfigError(f"{place}: {name} must be @njit, and take {signature}") from None
 
-    def _check_names(self, place: str) -> None:
-        for name in (*self.states, *self.rows):
-            try:
-                unit_of(name)
-            except LogError as error:
-                raise ConfigError(f"{place}: {str(error).replace('channel', 'state or row')}") from None
-        sensors, grouped = self.sensor_names, [row for _, rows in self.sensors for row in rows]
-        given = {"states": self.states, "rows": self.rows, "sensors": sensors, "inputs": self.inputs}
-        for what, names in given.items():
-            if len(set(names)) < len(names):
-                raise ConfigError(f"{place}: {what} {list(names)} name one of them twice")
-            if len(names) > MOST:
-                raise ConfigError(f"{place}: there are {len(names)} {what}, at most {MOST} are possible")
-        if sorted(grouped) != sorted(self.rows):
-            raise ConfigError(f"{place}: its sensors must hold every row once; they hold {grouped}")
-        referring = {"references": sensors, "held": sensors, "positions": self.states}
-        referring |= {"angle_states": self.states, "angle_rows": self.rows}
-        for what, known in referring.items():
-            for unknown in (name for name in getattr(self, what) if name not in known):
-                raise ConfigError(f"{place}: {what} name {unknown!r}, which is none of {', '.join(known)}")
-
     @property
     def sensor_names(self) -> tuple[str, ...]:
         """Name of each sensor."""
         return tuple(name for name, _ in self.sensors)
 
 
-@dataclass(frozen=True, eq=False)
-class Noise:
-    """How much a model is off: variances in squared natural units, as ``0.02**2``.
-
-    Raises
-    ------
-    ConfigError
-        where a shape does not fit, or something is not finite, not symmetric or not positive (semi)definite.
-
-    Examples
-    --------
-    >>> Noise([0.1**2], np.diag([0.01**2, 0.02**2]))
-    Traceback (most recent call last):
-    terrain.errors.ConfigError: measurement_variance is a matrix: rows are taken as independent, give (m,)
-    """
-
-    process_variance: Array  #: (d,) or (d, d), **per second**: a step of dt adds Q dt
-    #: (m,) of each row, or (n, m) where it changes from sample to sample (of a sample whose variance is NaN, zero or
-    #: negative, the row is not used); rows are independent
-    measurement_variance: Array
-    initial_variance: Array | None = None  #: (d,) or (d, d); what the model says without
-    #: (n, d), **per second**, of each sample beside the process variance: for states that change faster at times
-    walk_variance: Array | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("process_variance", "initial_variance"):
-            if (given := getattr(self, name)) is not None:
-                object.__setattr__(self, name, _covariance(name, given, definite=name == "initial_variance"))
-        if self.walk_variance is not None:
-            walk = read_only(self.walk_variance)
-            object.__setattr__(self, "walk_variance", walk)
-            if walk.ndim != 2 or not ((walk >= 0) & (walk < np.inf)).all():
-                raise ConfigError("walk_variance must be (n, d), finite and not below zero")
-        r = read_only(self.measurement_variance)
-        object.__setattr__(self, "measurement_variance", r)
-        if r.ndim not in (1, 2):
-            raise ConfigError(f"measurement_variance has shape {r.shape}, (m,) or (n, m) is needed")
-        if r.ndim == 2 and r.shape[0] == r.shape[1] > 1 and (r == r.T).all() and np.ptp(r) > 0:
-            raise ConfigError("measurement_variance is a matrix: rows are taken as independent, give (m,)")
-        if r.ndim == 1 and not ((r > 0) & np.isfinite(r)).all():
-            raise ConfigError(f"measurement_variance {r.tolist()} must be above zero and finite")
-
-    def at(self, samples: Array) -> Noise:
-        """Return the noise of some samples (k,) by number, where it changes from sample to sample."""
-        r, walk = self.measurement_variance, self.walk_variance
-        r, walk = r[samples] if r.ndim == 2 else r, None if walk is None else walk[samples]
-        return Noise(self.process_variance, r, self.initial_variance, walk)
-
-
-def _covariance(what: str, given: Any, *, definite: bool) -> Array:
-    """Return a covariance (d, d) or the variances (d,) as a checked matrix."""
-    array = np.asarray(given, dtype=np.float64)
-    if array.ndim not in (1, 2) or array.shape[0] != array.shape[-1] or not array.size:
-        raise ConfigError(f"{what} has shape {array.shape}, (d,) or (d, d) is needed")
-    matrix = np.diag(array) if array.ndim == 1 else array
-    if not np.isfinite(matrix).all():
-        raise ConfigError(f"{what} holds a value that is not finite")
-    scale = np.abs(matrix).max()
-    if not np.allclose(matrix, matrix.T, rtol=0, atol=1e-12 * scale):
-        raise ConfigError(f"{what} is not symmetric")
-    smallest = float(np.linalg.eigvalsh(matrix)[0])
-    if (definite and smallest <= 0) or smallest < -1e-12 * scale:
-        kind = "definite" if definite else "semidefinite"
-        raise ConfigError(f"{what} is not positive {kind}: its smallest eigenvalue is {smallest:.3g}")
-    return read_only((matrix + matrix.T) / 2)
-
-
-@dataclass(frozen=True)
-class FilterSettings:
-    """When a measurement or a stamp is not believed; ``ConfigError`` where a value is out of its range.
-
-    Examples
-    --------
-    >>> FilterSettings(gate_probability=99.99)
-    Traceback (most recent call last):
-    terrain.errors.ConfigError: gate_probability is 99.99, a number over 0 up to 1 is required
-    """
+class FilterSettings(NamedTuple):
+    """When a measurement or a stamp is not believed."""
 
     #: a sensor's squared innovation under the value that chi-square stays under with this probability is believed; 1
     #: believes everything
@@ -236,19 +172,10 @@ class FilterSettings:
     #: over a longer step nothing is integrated; a log sampled slower than that needs another value
     max_gap_s: float = 1.0
 
-    def __post_init__(self) -> None:
-        if not 0 < self.gate_probability <= 1:
-            raise ConfigError(
-                f"gate_probability is {self.gate_probability}, a number over 0 up to 1 is required"
-            )
-        for name in ("reopen_after_s", "max_gap_s"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"{name} is {getattr(self, name)}, seconds above zero are required")
-
 
 DEFAULT_SETTINGS = FilterSettings()
 
-#: What is fixed by model, noise and settings: places of the rows, sensor by sensor (``order``), and where each sensor
+#: What is fixed by model and settings: places of the rows, sensor by sensor (``order``), and where each sensor
 #: begins among them; first state and covariance, what is added to it a second, and the largest squared innovation
 #: that is believed, by its number of rows.
 MODEL = record(
@@ -265,6 +192,10 @@ MODEL = record(
     }
 )
 
+#: All that a filter carries from one sample to the next: a copy is a snapshot.  Stamp of the last sample, that of a
+#: jump that is not believed yet, time since the speed over ground was measured; what became of the sensors of the
+#: last sample and how likely it was, for how long each was rejected (-1 for one that was not), and counts of what was
+#: left out.
 STATE = record(
     {
         **dict.fromkeys(("time_s", "pending_time_s", "reference_age_s", "log_likelihood"), float),
@@ -276,27 +207,19 @@ STATE = record(
         **dict.fromkeys(("gated", "not_finite", "numerical"), (int, MOST)),
     }
 )
-"""All that a filter carries from one sample to the next: a copy is a snapshot.
-
-Stamp of the last sample, that of a jump that is not believed yet, time since the speed over ground was
-measured; what became of the sensors of the last sample and how likely it was, for how long each was rejected (-1 for
-one that was not), and counts of what was left out."""
 
 #: Room to compute in.
 _WORK = record(
     {
-        **dict.fromkeys(("f", "fp", "h", "p_before"), (float, (MOST, MOST))),
+        **dict.fromkeys(("f", "fp", "h", "p_other"), (float, (MOST, MOST))),
+        **dict.fromkeys(("x_next", "z_hat", "nu", "dx", "dx_before"), (float, MOST)),
+        **dict.fromkeys(("g", "gain", "rounding", "moved"), (float, MOST)),
         "rows": (int, MOST),
-        **dict.fromkeys(
-            ("x_next", "x_before", "z_hat", "nu", "dx", "dx_before", "g", "gain", "rounding", "moved"),
-            (float, MOST),
-        ),
         "chosen": (bool, MOST),
     }
 )
 
-_SKIP, _START, _STEP, _JUMP = range(4)  # what the clock says of a row
-_UNSOUND = -1  # a use that is never reported
+_NOT_ADVANCED, _JUMPED, _START, _STEP, _GAP = range(5)  # what a stamp is; the first two are not taken
 
 _inner = inner(error_model="numpy")
 
@@ -322,36 +245,16 @@ def differentiate(function: Any, x: Array, dt: float, params: Array, y: Array, b
 
 
 @_inner
-def _follows(time_s: float, last_s: float, pending_s: float, max_gap_s: float) -> int:
-    """Return what a stamp would be: 1 taken, -1 taken as that of a clock set back, 0 not taken.
-
-    A jump is believed where the stamp follows one that jumped before.
-    """
-    if not math.isfinite(time_s):
-        return 0
+def _read_stamp(time_s: float, last_s: float, pending_s: float, max_gap_s: float) -> int:
+    """Return what a stamp is: a jump is believed where the stamp follows one that jumped before."""
     step_s = time_s - last_s
-    if abs(step_s) > max_gap_s:
-        since_jump_s = time_s - pending_s
-        believed = since_jump_s > 0.0 and since_jump_s <= max_gap_s
-        return (1 if step_s > 0.0 else -1) if believed else 0
-    return 0 if step_s <= 0.0 else 1
-
-
-@_inner
-def _read_stamp(model: Any, state: Any, time_s: float) -> tuple[int, float]:
-    """Say what the clock does, and move it."""
-    dt = time_s - state.time_s
-    jumps = abs(dt) > model.max_gap_s  # not the first, whose dt is NaN
-    if _follows(time_s, state.time_s, state.pending_time_s, model.max_gap_s) == 0:
-        if jumps and np.isfinite(time_s):
-            state.jumps += 1
-            state.pending_time_s = time_s
-        else:
-            state.not_advanced += 1
-        return _SKIP, dt
-    kind = _JUMP if jumps else (_START if np.isnan(dt) else _STEP)
-    state.time_s, state.pending_time_s = time_s, np.nan
-    return kind, dt
+    if not math.isfinite(time_s):
+        return _NOT_ADVANCED
+    if math.isnan(step_s):
+        return _START
+    if abs(step_s) <= max_gap_s:
+        return _STEP if step_s > 0.0 else _NOT_ADVANCED
+    return _GAP if 0.0 < time_s - pending_s <= max_gap_s else _JUMPED
 
 
 @_inner
@@ -361,28 +264,6 @@ def _copy(d: int, p: Array, x: Array, p_to: Array, x_to: Array) -> None:
         x_to[i] = x[i]
         for j in range(d):
             p_to[i, j] = p[i, j]
-
-
-@_inner
-def _predict(model: Any, state: Any, work: Any, dt: float, params: Array, propagate: Any) -> None:
-    """x_next = f(x, dt), and P <- F P F' + Q dt, symmetric to the last bit."""
-    d, p, f, fp = model.n_states, state.p, work.f, work.fp
-    f[:d, :d] = 0.0
-    fp[:d, :d] = 0.0
-    propagate(state.x[:d], dt, params, work.x_next[:d], f[:d])
-    for i in range(d):
-        for j in range(d):
-            if f[i, j] != 0.0:
-                for k in range(d):
-                    fp[i, k] += f[i, j] * p[j, k]
-    for i in range(d):
-        for k in range(i + 1):
-            total = model.q[i, k] * dt
-            for j in range(d):
-                if f[k, j] != 0.0:
-                    total += fp[i, j] * f[k, j]
-            p[i, k] = total
-            p[k, i] = total
 
 
 @_inner
@@ -399,47 +280,60 @@ def _reset_covariance(model: Any, state: Any, chosen: Array) -> None:
 
 
 @_inner
-def _step(model: Any, state: Any, work: Any, dt: float, walk: Array, params: Array, propagate: Any) -> None:
-    """Predict; where that leads out of this world, begin anew but for positions that do not."""
-    d, x, p = model.n_states, state.x, state.p
-    _copy(d, p, x, work.p_before, work.x_before)
-    _predict(model, state, work, dt, params, propagate)
+def _predict(
+    model: Any, state: Any, work: Any, is_gap: bool, dt: float, walk: Array, params: Array, propagate: Any
+) -> None:
+    """Predict x <- f(x, dt), and P <- F P F' + Q dt, symmetric to the last bit.
+
+    Where that leads out of this world, begin anew but for positions that do not.  Over a gap all covariances are
+    reset but those of the positions, which grow by what the speeds may have been, and the means stay.
+    """
+    d, x, p, f, fp, p_next = model.n_states, state.x, state.p, work.f, work.fp, work.p_other
+    if is_gap:
+        for i in range(d):
+            work.chosen[i] = not model.is_position[i]
+        _reset_covariance(model, state, work.chosen)
+    span_s = min(abs(dt), LONGEST_GAP_S)
+    f[:d, :d] = 0.0
+    fp[:d, :d] = 0.0
+    propagate(x[:d], span_s, params, work.x_next[:d], f[:d])
+    for i in range(d):
+        for j in range(d):
+            if f[i, j] != 0.0:
+                for k in range(d):
+                    fp[i, k] += f[i, j] * p[j, k]
     n_bad = 0
     for i in range(d):
-        p[i, i] += walk[i] * dt
-        n_bad += not ((abs(work.x_next[i]) <= LARGEST) & (p[i, i] > 0.0) & (p[i, i] <= WIDEST))
-        x[i] = work.x_next[i]
-    if n_bad > 0:
-        _copy(d, work.p_before, work.x_before, p, x)
+        for k in range(i + 1):
+            total = model.q[i, k] * span_s
+            for j in range(d):
+                if f[k, j] != 0.0:
+                    total += fp[i, j] * f[k, j]
+            p_next[i, k] = total
+            p_next[k, i] = total
+        p_next[i, i] += walk[i] * span_s
+        n_bad += not ((abs(work.x_next[i]) <= LARGEST) & (p_next[i, i] > 0.0) & (p_next[i, i] <= WIDEST))
+    if is_gap:
+        for i in range(d):
+            for j in range(d):
+                if model.is_position[i] and model.is_position[j]:
+                    p[i, j] = p_next[i, j]
+    elif n_bad == 0:
+        _copy(d, p_next, work.x_next, p, x)
+    else:
         for i in range(d):
             work.chosen[i] = not model.is_position[i] or p[i, i] > LARGEST**2
             if not model.is_position[i]:
                 x[i] = model.x0[i]
         _reset_covariance(model, state, work.chosen)
         state.lost += 1
-    state.reference_age_s += dt
-    for k in range(model.n_sensors):
-        if state.rejected_s[k] >= 0.0:
-            state.rejected_s[k] += dt
-
-
-@_inner
-def _predict_over_gap(model: Any, state: Any, work: Any, dt: float, params: Array, propagate: Any) -> None:
-    """Reset all covariances but those of the positions, which grow by what the speeds may have been."""
-    d = model.n_states
-    for i in range(d):
-        work.chosen[i] = not model.is_position[i]
-    _reset_covariance(model, state, work.chosen)
-    _copy(d, state.p, state.x, work.p_before, work.x_before)
-    _predict(model, state, work, min(abs(dt), LONGEST_GAP_S), params, propagate)
-    for i in range(d):
-        for j in range(d):
-            if not (model.is_position[i] and model.is_position[j]):
-                state.p[i, j] = work.p_before[i, j]
     # of a clock that was set back the age is unknown
     state.reference_age_s = state.reference_age_s + dt if dt > 0.0 else np.inf
     for k in range(model.n_sensors):
-        state.rejected_s[k] = -1.0
+        if is_gap:
+            state.rejected_s[k] = -1.0
+        elif state.rejected_s[k] >= 0.0:
+            state.rejected_s[k] += dt
 
 
 @_inner
@@ -503,7 +397,6 @@ def _condition_on(model: Any, state: Any, work: Any, nu: float, spread: float, r
         return False
     for i in range(d):
         work.dx[i] = work.moved[i]
-    for i in range(d):
         k, rest = gain[i], rounding[i]
         for j in range(d):
             p[i, j] = (p[i, j] - k * g[j]) + rest * gain[j]
@@ -511,9 +404,9 @@ def _condition_on(model: Any, state: Any, work: Any, nu: float, spread: float, r
 
 
 @_inner
-def _take_rows(model: Any, state: Any, work: Any, z: Array, variance: Array, k: int) -> int:
-    """Write the innovations of a sensor's rows that measured something; return how many did."""
-    n_rows = 0
+def _condition_on_sensor(model: Any, state: Any, work: Any, z: Array, variance: Array, k: int) -> None:
+    """Condition on all rows of a sensor, or on none: gate it, or reopen it once it was rejected for long."""
+    d, p, dx, rows, n_rows = model.n_states, state.p, work.dx, work.rows, 0
     for c in range(model.starts[k], model.starts[k + 1]):
         i = model.order[c]
         if np.isnan(z[i]):
@@ -523,51 +416,44 @@ def _take_rows(model: Any, state: Any, work: Any, z: Array, variance: Array, k: 
             continue
         nu = z[i] - work.z_hat[i]
         work.nu[i] = wrapped(nu) if model.is_angle_row[i] else nu
-        work.rows[n_rows] = i
+        rows[n_rows] = i
         n_rows += 1
-    return n_rows
-
-
-@_inner
-def _condition_on_sensor(model: Any, state: Any, work: Any, z: Array, variance: Array, k: int) -> None:
-    """Condition on all rows of a sensor, or on none: gate it, or reopen it once it was rejected for long."""
-    n_rows = _take_rows(model, state, work, z, variance, k)
     if n_rows == 0:
         return
-    d, p, dx, rows = model.n_states, state.p, work.dx, work.rows
     if n_rows > 1:  # one row alone is judged before anything changes
-        _copy(d, p, dx, work.p_before, work.dx_before)
-    use, threshold, square, likelihood = USED, model.thresholds[n_rows], np.nan, 0.0
+        _copy(d, p, dx, work.p_other, work.dx_before)
+    use, threshold, square, likelihood, is_sound = USED, model.thresholds[n_rows], np.nan, 0.0, True
     for attempt in range(2):
-        total, likelihood, sound, definite = 0.0, 0.0, True, True
+        total, likelihood, is_sound, is_definite = 0.0, 0.0, True, True
         for c in range(n_rows):
             r = variance[rows[c]]
             nu, spread = _innovation(model, state, work, rows[c])
             s = spread + r
-            definite &= s > 0.5 * r
+            is_definite &= s > 0.5 * r
             total += nu * nu / s
             likelihood -= 0.5 * (math.log(2.0 * math.pi * s) + nu * nu / s)
-            if definite and (c < n_rows - 1 or total <= threshold):
-                sound &= _condition_on(model, state, work, nu, spread, r)
+            if is_definite and (c < n_rows - 1 or total <= threshold):
+                is_sound &= _condition_on(model, state, work, nu, spread, r)
         if attempt == 0:
             square = total
-        if total <= threshold and sound and definite:
+        is_sound &= is_definite
+        if total <= threshold and is_sound:
             break
         if n_rows > 1 or attempt == 1:
-            _copy(d, work.p_before, work.dx_before, p, dx)
-        if not definite:  # rounding has made P no covariance: go on without its correlations
+            _copy(d, work.p_other, work.dx_before, p, dx)
+        if not is_definite:  # rounding has made P no covariance: go on without its correlations
             work.chosen[:] = True
             _reset_covariance(model, state, work.chosen)
-        if total <= threshold or attempt == 1 or not definite:
-            use = _UNSOUND
+        if total <= threshold or attempt == 1 or not is_definite:
+            is_sound = False
             break
         state.rejected_s[k] = max(state.rejected_s[k], 0.0)
         after_s = max(model.reopen_after_s, HELD_S) if model.is_held[k] else model.reopen_after_s
         if state.rejected_s[k] < after_s:
-            use = GATED
+            use, is_sound = GATED, True
             break
         use, threshold = REOPENED, np.inf
-        _copy(d, p, dx, work.p_before, work.dx_before)
+        _copy(d, p, dx, work.p_other, work.dx_before)
         _choose_states(model, state, work, k)
         _reset_covariance(model, state, work.chosen)
         worst = 0.0
@@ -578,7 +464,7 @@ def _condition_on_sensor(model: Any, state: Any, work: Any, z: Array, variance: 
             for j in range(d):
                 if work.chosen[j]:
                     p[j, j] = min(worst * p[j, j], LARGEST**2)
-    if use == _UNSOUND:
+    if not is_sound:
         state.numerical[k] += 1
         state.use[k] = GATED
         return
@@ -594,9 +480,7 @@ def _condition_on_sensor(model: Any, state: Any, work: Any, z: Array, variance: 
 
 
 class _Samples(NamedTuple):
-    """Stamps and measurements, variances, walks and inputs of each sample."""
-
-    time_s: Array
+    time_s: Array  #: stamps, and measurements, variances, walks and inputs of each
     z: Array
     variance: Array
     walk: Array
@@ -604,9 +488,7 @@ class _Samples(NamedTuple):
 
 
 class _Columns(NamedTuple):
-    """What is written of each sample: the first five only where they have rows."""
-
-    mean: Array
+    mean: Array  #: what is written of each sample: the first five only where they have rows
     cov: Array
     nis_dof: Array
     use: Array
@@ -630,21 +512,23 @@ def _take(
     """Take samples one by one: move the state, and write the columns."""
     model, state, work = model[0], state[0], work[0]
     d, m, n_sensors, x, p = model.n_states, model.n_rows, model.n_sensors, state.x, state.p
-    keep = columns.mean.shape[0] > 0
     for n in range(samples.time_s.size):
-        kind, dt = _read_stamp(model, state, samples.time_s[n])
-        columns.taken[n] = kind != _SKIP
+        time_s, dt = samples.time_s[n], samples.time_s[n] - state.time_s
+        kind = _read_stamp(time_s, state.time_s, state.pending_time_s, model.max_gap_s)
+        columns.taken[n] = kind >= _START
         for k in range(n_sensors):
             state.use[k], state.nis[k], state.nis_dof[k], state.likelihood[k] = ABSENT, np.nan, 0, 0.0
-        if kind != _SKIP and kind != _JUMP:
-            first = params.size - model.n_inputs
+        if kind == _NOT_ADVANCED:
+            state.not_advanced += 1
+        elif kind == _JUMPED:
+            state.jumps += 1
+            state.pending_time_s = time_s
+        else:
+            state.time_s, state.pending_time_s = time_s, np.nan
             for i in range(model.n_inputs):
-                params[first + i] = samples.inputs[n, i]
-        if kind == _STEP:
-            _step(model, state, work, dt, samples.walk[n], params, propagate)
-        elif kind == _JUMP:
-            _predict_over_gap(model, state, work, dt, params, propagate)
-        if columns.taken[n]:
+                params[params.size - model.n_inputs + i] = samples.inputs[n, i]
+            if kind != _START:
+                _predict(model, state, work, kind == _GAP, dt, samples.walk[n], params, propagate)
             work.h[:m, :d] = 0.0
             observe(x[:d], params, work.z_hat[:m], work.h[:m])
             work.dx[:] = 0.0
@@ -658,7 +542,7 @@ def _take(
                     p[j, i] = p[i, j]
         for k in range(n_sensors):
             columns.nis[n, k], columns.likelihood[n, k] = state.nis[k], state.likelihood[k]
-        if keep:
+        if columns.mean.shape[0] > 0:
             columns.reference_age_s[n] = state.reference_age_s
             for k in range(n_sensors):
                 columns.use[n, k], columns.nis_dof[n, k] = state.use[k], state.nis_dof[k]
@@ -669,11 +553,11 @@ def _take(
 
 
 class Filter:
-    """A filter in use: a model with its noise, and the state that each sample moves.
+    """A filter in use: a model, and the state that each sample moves.
 
     Parameters
     ----------
-    model, noise, settings : as of :func:`run_filter`
+    model, settings : as of :func:`run_filter`
 
     Attributes
     ----------
@@ -682,42 +566,57 @@ class Filter:
     mean, cov : (d,) and (d, d) of the state, views that the next step writes over
     use : (k,) what became of each sensor at the last step
 
-    Raises
-    ------
-    DataError
-        where the noise does not fit the model.
-
     Examples
     --------
-    >>> from terrain.estimation.models.skid import make_skid_filter, skid_noise
+    >>> from terrain.estimation.models.skid import make_skid_filter
     >>> from terrain.robots import load_robot
-    >>> robot = load_robot("husky")
-    >>> filter = Filter(make_skid_filter(robot), skid_noise(robot))
+    >>> filter = Filter(make_skid_filter(load_robot("husky")))
     >>> filter.step(0.0, np.array([0.4, 0.4, 0.0, np.nan])), filter.step(0.0, np.full(4, np.nan))
     (True, False)
     >>> dict(zip(filter.model.states, filter.mean.round(2), strict=True))["speed_mps"]
     np.float64(0.4)
     """
 
-    def __init__(self, model: FilterModel, noise: Noise, settings: FilterSettings = DEFAULT_SETTINGS) -> None:
-        d, m, k = len(model.states), len(model.rows), len(model.sensors)
-        self.model, self.noise = model, noise
-        self._fixed = _fixed(model, noise, settings)
+    def __init__(self, model: FilterModel, settings: FilterSettings = DEFAULT_SETTINGS) -> None:
+        sizes = d, m, k, n_inputs = tuple(
+            len(names) for names in (model.states, model.rows, model.sensors, model.inputs)
+        )
+        fixed = filled(
+            MODEL,
+            **dict(zip(("n_states", "n_rows", "n_sensors", "n_inputs"), sizes, strict=True)),
+            reopen_after_s=settings.reopen_after_s - _SLACK_S,
+            max_gap_s=settings.max_gap_s + _SLACK_S,
+            thresholds=np.inf,
+        )
+        one = fixed[0]
+        one["order"][:m] = [model.rows.index(row) for _, rows in model.sensors for row in rows]
+        one["starts"][: k + 1] = np.cumsum([0, *(len(rows) for _, rows in model.sensors)])
+        for name, names, chosen in (
+            ("is_reference", model.sensor_names, model.references),
+            ("is_held", model.sensor_names, model.held),
+            ("is_angle_row", model.rows, model.angle_rows),
+            ("is_angle_state", model.states, model.angle_states),
+            ("is_position", model.states, model.positions),
+        ):
+            one[name][: len(names)] = np.isin(names, chosen)
+        one["x0"][:d] = model.initial_mean
+        one["p0"][:d, :d], one["q"][:d, :d] = model.initial_variance, model.process_variance
+        dof = np.arange(1.0, 1 + max(len(rows) for _, rows in model.sensors))
+        one["thresholds"][1 : 1 + dof.size] = chdtri(dof, 1 - settings.gate_probability)
+        self.model, self._max_gap_s = model, settings.max_gap_s + _SLACK_S
         self.state = filled(
-            STATE, time_s=math.nan, pending_time_s=math.nan, reference_age_s=math.inf, rejected_s=-1.0
+            STATE, nis=np.nan, time_s=np.nan, pending_time_s=np.nan, reference_age_s=np.inf, rejected_s=-1.0
         )
         self.mean, self.cov = self.state["x"][0, :d], self.state["p"][0, :d, :d]
         self.use = self.state["use"][0, :k]
-        self.mean[:], self.cov[:] = model.initial_mean, self._fixed["p0"][0, :d, :d]
-        self.state["nis"] = np.nan
-        params = np.append(model.params, np.zeros(len(model.inputs)))
+        self.mean[:], self.cov[:] = model.initial_mean, model.initial_variance
+        params = np.append(model.params, np.zeros(n_inputs))
         functions = (  # compiled with their signature: finding them costs more than a step
             CompileResultWAP(getattr(model, name).overloads[tuple(signature.args)])
             for name, signature in _SIGNATURES.items()
         )
-        self._kernel = (self._fixed, self.state, filled(_WORK), params, *functions)
-        sizes = (m, m, d, len(model.inputs))
-        self._sample = _Samples(np.empty(1), *(np.zeros((1, size)) for size in sizes))
+        self._kernel = (fixed, self.state, filled(_WORK), params, *functions)
+        self._sample = _Samples(np.empty(1), *(np.zeros((1, size)) for size in (m, m, d, n_inputs)))
         self._nothing = self._columns(1, keep=False)
         self._compiled: Callable[..., None] | None = None
 
@@ -734,13 +633,13 @@ class Filter:
         Parameters
         ----------
         z : (m,) measurements, NaN where there is none
-        variance : (m,) in place of that of the noise, which has to be (m,) without
+        variance : (m,) in place of that of the model
         walk : (d,) variance per second up to the sample, beside the process variance
         inputs : (k,) of the step up to the sample
         """
         sample = self._sample
         sample.time_s[0], sample.z[0] = time_s, z
-        sample.variance[0] = self.noise.measurement_variance if variance is None else variance
+        sample.variance[0] = self.model.measurement_variance if variance is None else variance
         sample.walk[0] = 0.0 if walk is None else walk
         sample.inputs[0] = 0.0 if inputs is None else inputs
         if self._compiled is None:
@@ -751,43 +650,49 @@ class Filter:
             self._compiled(*self._kernel, sample, self._nothing)
         return bool(self._nothing.taken[0])
 
-    def run(self, time_s: Array, z: Array, inputs: Array | None = None, *, keep: bool = True) -> _Columns:
-        """Take in all samples of a log; return what is known at each, empty columns unless kept."""
+    def run(
+        self,
+        time_s: Array,
+        z: Array,
+        variance: Array | None = None,
+        walk: Array | None = None,
+        inputs: Array | None = None,
+        *,
+        keep: bool = True,
+    ) -> _Columns:
+        """Take in all samples of a log, each as of :meth:`step`; return what is known at each, empty unless kept."""
         d, m, stamps = len(self.model.states), len(self.model.rows), np.array(time_s, dtype=np.float64)
         n, samples = stamps.size, [stamps]
+        variance = self.model.measurement_variance if variance is None else variance
         for name, array, size in (
             ("z", z, m),
-            ("measurement_variance", self.noise.measurement_variance, m),
-            ("walk_variance", self.noise.walk_variance, d),
+            ("variance", variance, m),
+            ("walk", walk, d),
             ("inputs", inputs, len(self.model.inputs)),
         ):
             given = np.zeros((1, size)) if array is None else np.atleast_2d(array)
             if given.shape != (n, size) and (name == "z" or given.shape != (1, size)):
-                shape = np.shape(z) if name == "z" else given.shape
-                raise DataError(f"filter {self.model.name}: {name} has shape {shape}, {(n, size)} is needed")
+                raise DataError(
+                    f"filter {self.model.name}: {name} has shape {given.shape}, {(n, size)} is needed"
+                )
             samples.append(np.array(np.broadcast_to(given, (n, size)), dtype=np.float64, order="C"))
         columns = self._columns(n, keep=keep)
         _take(*self._kernel, _Samples(*samples), columns)
         return columns
 
     def _columns(self, n: int, *, keep: bool) -> _Columns:
-        d, k, n_kept = len(self.model.states), len(self.model.sensors), n if keep else 0
-        return _Columns(
-            np.empty((n_kept, d)),
-            np.empty((n_kept, d, d)),
-            np.empty((n_kept, k), np.int8),
-            np.empty((n_kept, k), np.int8),
-            np.empty(n_kept),
-            np.empty((n, k)),
-            np.empty((n, k)),
-            np.zeros(n, np.bool_),
-        )
+        d, k, n_kept = self.mean.size, self.use.size, n if keep else 0
+        nis_dof, use = np.empty((2, n_kept, k), np.int8)
+        nis, likelihood = np.empty((2, n, k))
+        mean, cov, age_s = np.empty((n_kept, d)), np.empty((n_kept, d, d)), np.empty(n_kept)
+        return _Columns(mean, cov, nis_dof, use, age_s, nis, likelihood, np.zeros(n, np.bool_))
 
     def follows(self, time_s: float) -> int:
         """Return what a stamp would be: 1 taken, -1 taken as that of a clock set back, 0 not taken."""
         last_s, pending_s = (float(self.state[name][0]) for name in ("time_s", "pending_time_s"))
-        follows: int = _follows.py_func(time_s, last_s, pending_s, float(self._fixed["max_gap_s"][0]))
-        return follows
+        if _read_stamp.py_func(time_s, last_s, pending_s, self._max_gap_s) < _START:
+            return 0
+        return -1 if time_s < last_s else 1
 
     def known(self, states: Sequence[str]) -> dict[str, tuple[float, float]]:
         """Return mean and standard deviation of those of some states that the filter has, by name."""
@@ -804,7 +709,7 @@ class Filter:
         for name, (mean, std) in known.items():
             if name in self.model.states:
                 i = self.model.states.index(name)
-                variance = std**2 + float(self.noise.process_variance[i, i]) * age_s
+                variance = std**2 + float(self.model.process_variance[i, i]) * age_s
                 if variance < self.cov[i, i]:
                     self.mean[i], self.cov[i, i] = mean, variance
 
@@ -817,61 +722,21 @@ class Filter:
     def dropped(self) -> dict[str, int]:
         """What was not taken so far, as counts by kind."""
         state = self.state[0]
-        counts = {
-            "time did not advance": int(state["not_advanced"]),
-            "clock jump": int(state["jumps"]),
-            "state numerical": int(state["lost"]),
-        }
+        kinds = {"time did not advance": "not_advanced", "clock jump": "jumps", "state numerical": "lost"}
+        counts = {kind: int(state[name]) for kind, name in kinds.items()}
         for k, sensor in enumerate(self.model.sensor_names):
-            for kind in ("gated", "not_finite", "numerical"):
-                counts[f"{sensor} {kind.replace('_', ' ')}"] = int(state[kind][k])
+            for name in ("gated", "not_finite", "numerical"):
+                counts[f"{sensor} {name.replace('_', ' ')}"] = int(state[name][k])
         return {kind: n for kind, n in counts.items() if n}
-
-
-def _fixed(model: FilterModel, noise: Noise, settings: FilterSettings) -> Array:
-    """Return the record of a model, its noise and the settings, which are checked against it."""
-    d, m = len(model.states), len(model.rows)
-    for name in ("process_variance", "initial_variance"):
-        matrix = getattr(noise, name)
-        if matrix is not None and len(matrix) != d:
-            raise DataError(f"filter {model.name}: {name} is for {len(matrix)} states, it has {d}")
-    if (n_rows := noise.measurement_variance.shape[-1]) != m:
-        raise DataError(f"filter {model.name}: measurement_variance is for {n_rows} rows, it has {m}")
-    fixed = filled(
-        MODEL,
-        n_states=d,
-        n_rows=m,
-        n_sensors=len(model.sensors),
-        n_inputs=len(model.inputs),
-        reopen_after_s=settings.reopen_after_s - _SLACK_S,
-        max_gap_s=settings.max_gap_s + _SLACK_S,
-        thresholds=np.inf,
-    )
-    one = fixed[0]
-    one["order"][:m] = [model.rows.index(row) for _, rows in model.sensors for row in rows]
-    one["starts"][: len(model.sensors) + 1] = np.cumsum([0, *(len(rows) for _, rows in model.sensors)])
-    for name, names, chosen in (
-        ("is_reference", model.sensor_names, model.references),
-        ("is_held", model.sensor_names, model.held),
-        ("is_angle_row", model.rows, model.angle_rows),
-        ("is_angle_state", model.states, model.angle_states),
-        ("is_position", model.states, model.positions),
-    ):
-        one[name][: len(names)] = [each in chosen for each in names]
-    initial = np.diag(model.initial_std**2) if noise.initial_variance is None else noise.initial_variance
-    one["x0"][:d] = model.initial_mean
-    one["p0"][:d, :d], one["q"][:d, :d] = initial, noise.process_variance
-    dof = np.arange(1.0, 1 + max(len(rows) for _, rows in model.sensors))
-    one["thresholds"][1 : 1 + dof.size] = chdtri(dof, 1 - settings.gate_probability)
-    return fixed
 
 
 def run_filter(
     model: FilterModel,
-    noise: Noise,
     time_s: Array,
     z: Array,
     settings: FilterSettings = DEFAULT_SETTINGS,
+    variance: Array | None = None,
+    walk: Array | None = None,
     inputs: Array | None = None,
 ) -> StateTrack:
     """Filter a whole log.
@@ -879,10 +744,12 @@ def run_filter(
     Parameters
     ----------
     model : what is estimated, from what
-    noise : how much either is off
     time_s : (n,) stamps, at any spacing
     z : (n, m) measurements, NaN where there is none
     settings : gates and gaps
+    variance : (n, m) where it changes from sample to sample; of a sample whose variance is NaN, zero or negative, the
+        row is not used
+    walk : (n, d) variance per second up to each sample, beside the process variance
     inputs : (n, k) of the step up to each sample; zeros without
 
     Returns
@@ -896,7 +763,7 @@ def run_filter(
     Raises
     ------
     DataError
-        where the shapes do not fit each other, the model or the noise.
+        where the shapes do not fit each other or the model.
 
     Notes
     -----
@@ -905,9 +772,9 @@ def run_filter(
     the gap.  The means are kept because a logger pauses more often than a drive ends, and because what a gap
     does not change, as a gyro's bias, is best known from before; the covariance makes either harmless.
     """
-    session = Filter(model, noise, settings)
+    session = Filter(model, settings)
     stamps = np.array(time_s, dtype=np.float64)
-    columns = session.run(stamps, z, inputs)
+    columns = session.run(stamps, z, variance, walk, inputs)
     reached = np.maximum.accumulate(np.where(columns.taken, stamps, -np.inf))
     shown = columns.taken & (stamps > np.append(-np.inf, reached[:-1])[: stamps.size])
     dropped = session.dropped
@@ -917,16 +784,18 @@ def run_filter(
         stamps, columns = stamps[shown], _Columns(*(column[shown] for column in columns))
     for array in (stamps, *columns):
         array.flags.writeable = False
+    mean, cov, nis_dof, use, age_s, nis, *_ = columns
+    log_likelihood = float(session.state["log_likelihood"][0])
     return StateTrack(
         stamps,
-        columns.mean,
-        columns.cov,
+        mean,
+        cov,
         model.states,
-        columns.nis,
-        columns.nis_dof,
-        columns.use,
+        nis,
+        nis_dof,
+        use,
         model.sensor_names,
-        columns.reference_age_s,
-        float(session.state["log_likelihood"][0]),
+        age_s,
+        log_likelihood,
         dropped,
     )

@@ -41,11 +41,10 @@ from terrain.estimation.models.skid import (
     make_skid_filter,
     motion_at,
     motion_memory,
-    skid_noise,
     within_bounds,
 )
-from terrain.estimation.models.swerve import Schedule, default_noise, make_filter
-from terrain.estimation.wheel_slip import STALE_AFTER_S, SlipOfInstant
+from terrain.estimation.models.swerve import make_filter, scheduled
+from terrain.estimation.wheel_slip import STALE_AFTER_S, WheelSlip
 from terrain.extension import Correction, RegionMonitor, check_corrected
 from terrain.logs.schema import ESTIMATOR_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Reading
@@ -386,16 +385,11 @@ class LiveFilter(Live):
             channels = {**CHANNELS, "wheels": robot.rate_channels} if self._skids else CHANNELS
         has_gnss = not self._skids and initial_yaw_rad is not None and "gnss" in channels
         if self._skids:
-            self.model, noise = make_skid_filter(robot), skid_noise(robot)
+            self.model = make_skid_filter(robot)
         else:
             self.model = make_filter(filter_name, robot, with_gnss=has_gnss)
             robot.require("motors", "steering", "sensors")
-            noise = default_noise(filter_name, robot, has_gnss)
-        self.name, self.states, self.filter = (
-            self.model.name,
-            self.model.states,
-            Filter(self.model, noise, SETTINGS),
-        )
+        self.name, self.states, self.filter = self.model.name, self.model.states, Filter(self.model, SETTINGS)
         sensors, camera = robot.completed.sensors, robot.completed.camera
         rates = {
             "wheels": sensors.wheels_rate_hz,
@@ -407,15 +401,13 @@ class LiveFilter(Live):
         arriving = {"is_causal": True, "is_live": True}
         self._settings = feed.feed_settings(robot, period_s, yaw_rad, gnss_latency_s, **arriving)
         self._feed, self._rows = feed.new_feed(), np.full((1, feed.N_NUMBERS), np.nan)
-        self._schedule = Schedule(self.model, feed.ROWS) if self.model.inputs else None
         self._monitor = None if self._skids else HealthMonitor(robot, self.model)
-        self._slip, self._region = SlipOfInstant(robot, self.states), RegionMonitor(robot)
+        self._slip, self._region = WheelSlip(robot, self.states), RegionMonitor(robot)
         self._motion = motion_memory()
         memories = [self.filter.state, self._feed, self._motion]
         memories += [] if self._monitor is None else [self._monitor.memory]
         self._memories = [memory.view(np.uint8) for memory in memories]  # bytes are copied at once
         self._row_places = [feed.ROWS.index(row) for row in self.model.rows]
-        self._gnss_places = [k for k, row in enumerate(self.model.rows) if row in feed.GNSS_ROWS]
         motion = ("speed_mps", "", "yaw_rate_radps", "", "") if self._skids else _MOTION
         self._motion_places = feed.places_among(motion, self.states).tolist()
         check_channels("wheels", robot.rate_channels, channels.get("wheels", ()))
@@ -497,13 +489,8 @@ class LiveFilter(Live):
         if leapt is not None:
             self._measure(leapt)
         rates, wheels = self._measure(tick), self._no_wheels if tick.wheels is None else tick.wheels
-        variance, walk, inputs = filter_.noise.measurement_variance, None, None
-        if self._schedule is not None:
-            (variance,), (walk,), (inputs,) = self._schedule(self._rows[:, : len(feed.ROWS)], variance)
-        if self._gnss_places:
-            variance = np.array(variance)
-            variance[self._gnss_places] = row[len(feed.ROWS) :]
-        filter_.step(time_s, row[self._row_places], variance, walk, inputs)
+        now = scheduled(self.model, self._rows[:, : len(feed.ROWS)], self._rows[:, len(feed.ROWS) :])
+        filter_.step(time_s, row[self._row_places], *(None if part is None else part[0] for part in now))
         if self._monitor is not None:
             self._monitor.judge(time_s, wheels, rates, self._rows, self._feed, filter_.state)
         mean, std = filter_.mean.copy(), np.sqrt(filter_.cov.diagonal())
@@ -520,7 +507,10 @@ class LiveFilter(Live):
         else:
             motor_radps = rates
             wheel_speed_mps = robot.wheel_speeds_mps(rates / robot.motors.reduction_ratio)
-            slip_ratio, slip_std = self._slip.at(time_s, filter_, self._rows, self._feed)
+            speeds, ages_s = robot.wheel_speeds_mps(self._rows[:, : len(robot.wheels)]), np.array([age_s])
+            unmeasured_s = time_s - self._feed["received_s"].min(axis=1)
+            slips = self._slip(mean[None], filter_.cov[None], speeds, ages_s, unmeasured_s)
+            slip_ratio, slip_std = (part[0] for part in slips)
         v_x, v_y, turn, a_x, a_y = self._motion_of(mean)
         if self._region.compares:
             self._region.step(time_s, float(wheel_speed_mps.mean()), turn)
@@ -617,7 +607,7 @@ Estimator = LiveFilter | LiveObserver
 #: Filters and observers that run sample by sample, by drive, without a file of their own; the first is used where
 #: none is named.
 LIVE_FILTERS: Mapping[str, tuple[str, ...]] = {
-    "swerve": ("vio15", "vio12", "slip14", "encoder12"),
+    "swerve": ("vio15", "vio12", "encoder12"),
     "skid_steer": ("skid",),
     "tracked": ("skid", "tracked", "slip-learning", "gyrodometry", "encoder-odometry"),
     "bicycle": ("sideslip-multi", "sideslip-dynamic", "sideslip-kinematic"),

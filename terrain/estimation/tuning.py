@@ -20,9 +20,9 @@ from enum import StrEnum
 import numpy as np
 
 from terrain.errors import DataError
-from terrain.estimation.estimate import model_and_noise
+from terrain.estimation.estimate import model_of
 from terrain.estimation.feed import measurement_table
-from terrain.estimation.filter import Filter, FilterModel, FilterSettings, Noise
+from terrain.estimation.filter import Filter, FilterModel, FilterSettings
 from terrain.extension import corrected, corrected_log
 from terrain.identify import Parameter, identify
 from terrain.records import Array, RunLog
@@ -62,8 +62,8 @@ class TunedNoise:
 
 def tuned_noise(
     runs: Sequence[RunLog], robot: Robot | None, name: str, names: Sequence[str] | None = None
-) -> tuple[Noise, TunedNoise]:
-    """Return noise under which runs as measured are most likely, and what became of each group.
+) -> tuple[Array, TunedNoise]:
+    """Return the process variance under which runs as measured are most likely, and what became of each group.
 
     Parameters
     ----------
@@ -79,45 +79,41 @@ def tuned_noise(
         raise DataError(f"there is no run {unknown!r} to tune on; there are {', '.join(by_id)}")
     robot = robot or packaged_robot(by_id[names[0]].robot)
     logs, robot = [corrected_log(by_id[each], robot) for each in names], corrected(robot)
-    model, noise = model_and_noise(logs[0], robot, name)
+    model = model_of(logs[0], robot, name)
     tables = [measurement_table(run, robot) for run in logs]
     samples = [(table.time_s, table.columns(model.rows)) for table in tables]
-    return tune_noise(model, samples, noise, tuple(names))
+    tuned, report = tune_noise(model, samples, tuple(names))
+    return tuned.process_variance, report
 
 
 def tune_noise(
-    model: FilterModel, samples: Sequence[tuple[Array, Array]], noise: Noise, runs: tuple[str, ...] = ()
-) -> tuple[Noise, TunedNoise]:
+    model: FilterModel, samples: Sequence[tuple[Array, Array]], runs: tuple[str, ...] = ()
+) -> tuple[FilterModel, TunedNoise]:
     """Scale the process variances of each of :data:`GROUPS` so that samples become as likely as they can.
 
-    ``samples`` are ``time_s (n,), z (n, m)`` of each run, by whose ids they are reported; the variances of measurements
-    must not change from sample to sample.
+    ``samples`` are ``time_s (n,), z (n, m)`` of each run, by whose ids they are reported.
     """
     members = {name: [state.startswith(name) for state in model.states] for name in GROUPS}
     members = {name: states for name, states in members.items() if any(states)}
 
-    def scaled(log_scales: Array) -> Noise:
+    def scaled(log_scales: Array) -> FilterModel:
         std = np.ones(len(model.states))
         for states, log_scale in zip(members.values(), log_scales.tolist(), strict=True):
             std[states] = math.exp(0.5 * log_scale)
-        return replace(noise, process_variance=noise.process_variance * np.outer(std, std))
+        return replace(model, process_variance=model.process_variance * np.outer(std, std))
 
     def run(log_scales: Array) -> tuple[Array, Array]:
         """Return of each sensor at each sample its squared innovation, 0 where there is none, and its likelihood."""
-        tried, nis, likelihoods = scaled(log_scales), [], []
-        for sample in samples:
-            columns = Filter(model, tried, FilterSettings(gate_probability=1.0)).run(*sample, keep=False)
-            nis.append(np.nan_to_num(columns.nis))
-            likelihoods.append(columns.likelihood)
-        return np.concatenate(nis), np.concatenate(likelihoods)
+        tried, ungated = scaled(log_scales), FilterSettings(gate_probability=1.0)
+        columns = [Filter(tried, ungated).run(*sample, keep=False) for sample in samples]
+        nis = np.nan_to_num(np.concatenate([each.nis for each in columns]))
+        return nis, np.concatenate([each.likelihood for each in columns])
 
-    def likelihood(log_scales: Array) -> float:
-        return float(run(log_scales)[1].sum())
-
-    log_r = np.log(2 * np.pi * noise.measurement_variance)
+    log_r = np.log(2 * np.pi * model.measurement_variance)
     known = np.isfinite(np.concatenate([z for _, z in samples])) * log_r
-    by_sensor = [known[:, [model.rows.index(row) for row in rows]].sum(axis=1) for _, rows in model.sensors]
-    least = np.column_stack(by_sensor)
+    least = np.column_stack(
+        [known[:, [model.rows.index(row) for row in rows]].sum(axis=1) for _, rows in model.sensors]
+    )
 
     def residual(log_scales: Array) -> Array:
         nis, likelihoods = run(log_scales)
@@ -125,15 +121,14 @@ def tune_noise(
         return np.asarray(np.sqrt(np.concatenate([nis.ravel(), np.maximum(wider, 0.0).ravel()])))
 
     widest = math.log(WIDEST_SCALE)
-    parameters = [Parameter(name, 0.0, -widest, widest) for name in members]
-    fit = identify(residual, parameters, max_nfev=MAX_STEPS)
-    after, status = likelihood(fit.value), {}
+    fit = identify(residual, [Parameter(name, 0.0, -widest, widest) for name in members], max_nfev=MAX_STEPS)
+    before, after = (float(run(at)[1].sum()) for at in (np.zeros(len(members)), fit.value))
+    status = {}
     for i, name in enumerate(members):
         shift = math.log(2) * np.eye(len(members))[i]
-        drop = after - max(likelihood(fit.value + shift), likelihood(fit.value - shift))
+        drop = after - max(float(run(fit.value + side * shift)[1].sum()) for side in (1.0, -1.0))
         status[name] = TuningStatus.FOUND if drop > CLEAR_DROP else TuningStatus.NOT_EXCITED
         if abs(fit.value[i]) > widest - AT_END:
             status[name] = TuningStatus.AT_BOUND
     scales = dict(zip(members, np.exp(fit.value).tolist(), strict=True))
-    before = likelihood(np.zeros(len(members)))
     return scaled(fit.value), TunedNoise(runs, before, after, scales, status)

@@ -6,14 +6,12 @@ The definition of the slip ratio is :func:`terrain.slip.slip_ratio`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from terrain.errors import DataError
-from terrain.estimation.feed import UNMEASURED_AFTER_S, MeasurementTable
-from terrain.estimation.filter import Filter
+from terrain.estimation.feed import UNMEASURED_AFTER_S, MeasurementTable, places_among
 from terrain.kernels import njit
 from terrain.kinematics.wheels import in_wheel_frame, point_velocity
 from terrain.records import Array, SlipTrack, StateTrack, read_only
@@ -30,26 +28,20 @@ STEADY_BEFORE_S, STEADY_AFTER_S = 1.0, 0.25
 #: Age of the last speed over ground beyond which slip counts as stale: one and a half periods of GNSS, at 10 Hz the
 #: slowest sensor of it, so that no sound one is called so; a 1 m/s^2 start gains 0.15 m/s unseen.
 STALE_AFTER_S = 0.15
+LONGEST_S = 1e300  #: Age of a speed over ground that was measured at any time.
 
 
-def wheel_slip(
-    track: StateTrack, table: MeasurementTable, robot: Robot, wheel_speed_std_mps: float | None = None
-) -> SlipTrack:
-    """Return the slip of each wheel by what a filter believes; NaN unless it measured the speed over ground.
+class WheelSlip:
+    """The slip of each wheel of a robot from the state of a filter.
 
     Parameters
     ----------
-    track : of any filter with the states ``speed_x_mps`` (or ``speed_mps``) and ``yaw_rate_radps``, and
-        ``speed_y_mps`` and ``steer_<i>_rad`` where the robot can have them
-    table : what the filter measured, on the same clock
     robot : places and radius of the wheels
-    wheel_speed_std_mps : standard deviation of a wheel speed; by default that of the robot's file, unknown
-        without
-
-    Raises
-    ------
-    DataError
-        if the clocks differ, or a state or a row is missing.
+    states : of any filter: ``speed_x_mps`` (or ``speed_mps``) and ``yaw_rate_radps``, and ``speed_y_mps`` and
+        ``steer_<i>_rad`` where the robot can have them; ``DataError`` where one is missing
+    blind : whether the slip is that by the encoders and the filter's speed, whether or not it ever measured that over
+        ground.  Without such a sensor a filter takes the wheels' speed for the robot's, and the figure is close to 0 on
+        any ground (thesis 4.6)
 
     Notes
     -----
@@ -62,80 +54,62 @@ def wheel_slip(
     ``slip_std`` is to first order ``sqrt(g P g')`` with the state's whole covariance, and the wheel speed's
     variance added where that is not in the state.
     """
-    slip = _slip(track, table, robot, wheel_speed_std_mps)
-    unseen = np.isinf(track.reference_age_s)
-    if f"slip_speed_{robot.wheels[0]}_mps" not in track.states:
-        unseen = unseen | slip.stale
-    unknown = np.repeat(unseen[:, None], len(robot.wheels), axis=1)
-    for i, row in enumerate(robot.wheel_rows):  # a wheel whose rate or angle was not measured for long
-        measured = np.isfinite(table.columns([row, *robot.steer_rows[i : i + 1]]))
-        last_s = np.maximum.accumulate(np.where(measured, table.time_s[:, None], -np.inf), axis=0)
-        unknown[:, i] |= (table.time_s[:, None] - last_s > UNMEASURED_AFTER_S).any(axis=1)
-    ratio, std = (np.where(unknown, np.nan, v) for v in (slip.slip_ratio, slip.slip_std))
-    return SlipTrack(slip.time_s, ratio, std, slip.wheels, slip.stale)
 
-
-def blind_slip(track: StateTrack, table: MeasurementTable, robot: Robot) -> SlipTrack:
-    """Return the slip by encoders and a filter's speed, whether or not it ever measured that over ground.
-
-    For showing what a filter without such a sensor is blind to: it takes the wheels' speed for the robot's,
-    and the figure is close to 0 on any ground (thesis 4.6).  :func:`wheel_slip`, for use, gives NaN there.
-    """
-    return _slip(track, table, robot, None, from_encoders=True)
-
-
-def _slip(
-    track: StateTrack,
-    table: MeasurementTable,
-    robot: Robot,
-    wheel_speed_std_mps: float | None,
-    from_encoders: bool = False,
-) -> SlipTrack:
-    """Slip and its standard deviation, measured over ground or not."""
-    if not np.array_equal(track.time_s, table.time_s):
-        raise DataError("the track and the measurements are not on one clock: filter this table")
-    places = _places(robot, track.states, from_encoders)
-    wheel_speed = np.ascontiguousarray(robot.wheel_speeds_mps(table.columns(robot.wheel_rows)))
-    std_mps = wheel_speed_scatter_mps(robot) if wheel_speed_std_mps is None else wheel_speed_std_mps
-    slip = np.empty((track.time_s.size, 2, len(robot.wheels)))
-    positions = np.array(robot.wheel_positions_m)
-    _slips(np.array(track.mean), np.array(track.cov), positions, places, wheel_speed, std_mps**2, slip)
-    stale = track.reference_age_s > STALE_AFTER_S
-    return SlipTrack(track.time_s, slip[:, 0], slip[:, 1], robot.wheels, stale)
-
-
-class SlipOfInstant:
-    """The slip of each wheel of a robot at the last step of a filter with some states: :func:`wheel_slip`, live."""
-
-    def __init__(self, robot: Robot, states: tuple[str, ...]) -> None:
-        self._robot, self._positions_m = robot, np.array(robot.wheel_positions_m)
-        self._has_slip_speed = f"slip_speed_{robot.wheels[0]}_mps" in states
-        self._places = _places(robot, states) if robot.steered else np.empty(0, np.int64)
+    def __init__(self, robot: Robot, states: tuple[str, ...], blind: bool = False) -> None:
+        speed = "speed_mps" if "speed_mps" in states else "speed_x_mps"
+        for name in (speed, "yaw_rate_radps", *["speed_y_mps"] * robot.steered, *robot.steer_rows):
+            if name not in states:
+                raise DataError(f"the track has no state {name!r}, only {', '.join(states)}")
+        slips = [f"slip_speed_{wheel}_mps" for wheel in robot.wheels]
+        self._oldest_s = math.inf if blind else (LONGEST_S if slips[0] in states else STALE_AFTER_S)
+        names = [speed, "speed_y_mps", "yaw_rate_radps", *(f"steer_{wheel}_rad" for wheel in robot.wheels)]
+        names += [""] * len(slips) if blind else slips
+        self._places, self._positions_m = places_among(names, states), np.array(robot.wheel_positions_m)
         self._variance = wheel_speed_scatter_mps(robot) ** 2
 
-    def at(self, time_s: float, session: Filter, rows: Array, feed: Array) -> tuple[Array, Array]:
-        """Return slip and standard deviation (wheels,) at a tick, of the row (1, n) of a feed and its memory."""
-        slip, age_s = np.full((1, 2, len(self._robot.wheels)), np.nan), session.reference_age_s
-        if not math.isinf(age_s) and (age_s <= STALE_AFTER_S or self._has_slip_speed):
-            speeds = self._robot.wheel_speeds_mps(rows[:, : len(self._robot.wheels)])
-            mean, cov = session.mean[None], np.ascontiguousarray(session.cov)[None]
-            _slips(mean, cov, self._positions_m, self._places, speeds, self._variance, slip)
-            received_s = feed["received_s"][0].min(axis=0)
-            slip[0, :, time_s - received_s > UNMEASURED_AFTER_S] = np.nan
-        return slip[0, 0], slip[0, 1]
+    def __call__(
+        self, mean: Array, cov: Array, wheel_speed_mps: Array, age_s: Array, unmeasured_s: Array
+    ) -> tuple[Array, Array]:
+        """Return slip and standard deviation (n, wheels); unless blind NaN where something is not known.
+
+        Parameters
+        ----------
+        mean, cov : (n, d) and (n, d, d) of the state
+        wheel_speed_mps : (n, wheels) as measured
+        age_s : (n,) time since the speed over ground was measured
+        unmeasured_s : (n, wheels) time since rate and angle of a wheel were
+        """
+        slip = np.full((2, *wheel_speed_mps.shape), np.nan)
+        known = (age_s <= self._oldest_s)[:, None] & ~(unmeasured_s > UNMEASURED_AFTER_S)
+        if known.any() or self._oldest_s == math.inf:
+            speeds = np.ascontiguousarray(wheel_speed_mps)
+            _slips(
+                np.array(mean), np.array(cov), self._positions_m, self._places, speeds, self._variance, slip
+            )
+        if self._oldest_s < math.inf:
+            slip[:, ~known] = np.nan
+        return slip[0], slip[1]
 
 
-def _places(robot: Robot, states: tuple[str, ...], from_encoders: bool = False) -> Array:
-    """Return where speeds, yaw rate, steering angles and slip speeds stand among states, -1 for what is none."""
-    speed = "speed_mps" if "speed_mps" in states else "speed_x_mps"
-    needed = [speed, "yaw_rate_radps", *(["speed_y_mps"] if robot.steered else []), *robot.steer_rows]
-    for name in needed:
-        if name not in states:
-            raise DataError(f"the track has no state {name!r}, only {', '.join(states)}")
-    slips = [f"slip_speed_{wheel}_mps" for wheel in robot.wheels]
-    names = [speed, "speed_y_mps", "yaw_rate_radps", *(f"steer_{wheel}_rad" for wheel in robot.wheels)]
-    names += ["" if from_encoders else name for name in slips]
-    return np.array([states.index(name) if name in states else -1 for name in names])
+def wheel_slip(track: StateTrack, table: MeasurementTable, robot: Robot, blind: bool = False) -> SlipTrack:
+    """Return :class:`WheelSlip` of a log.
+
+    ``table`` is what the filter measured, on the same clock; ``DataError`` if not, or if a state or a row is missing.
+    """
+    if not np.array_equal(track.time_s, table.time_s):
+        raise DataError("the track and the measurements are not on one clock: filter this table")
+    time_s = table.time_s[:, None]
+
+    def since_s(rows: tuple[str, ...]) -> Array:
+        known = np.isfinite(table.columns(rows))
+        return np.asarray(time_s - np.maximum.accumulate(np.where(known, time_s, -np.inf), axis=0))
+
+    unmeasured_s = since_s(robot.wheel_rows)
+    if robot.steered:
+        unmeasured_s = np.maximum(unmeasured_s, since_s(robot.steer_rows))
+    speeds, age_s = robot.wheel_speeds_mps(table.columns(robot.wheel_rows)), track.reference_age_s
+    slip = WheelSlip(robot, track.states, blind)(track.mean, track.cov, speeds, age_s, unmeasured_s)
+    return SlipTrack(track.time_s, *slip, robot.wheels, age_s > STALE_AFTER_S)
 
 
 @njit(error_model="numpy")
@@ -148,10 +122,10 @@ def _slips(
     wheel_speed_variance: float,
     slip: Array,
 ) -> None:
-    """Write ratio and standard deviation (n, 2, wheels) of the slip of n instants.
+    """Write ratio and standard deviation (2, n, wheels) of the slip of n instants.
 
-    ``places`` say where the state has what :func:`_places` names; where it has no slip speeds,
-    ``wheel_speed_mps`` (n, wheels) holds.
+    ``places`` say where the state has speeds, yaw rate, steering angles and slip speeds, -1 for what is none; where it
+    has no slip speeds, ``wheel_speed_mps`` (n, wheels) holds.
     """
     n_wheels = positions_m.shape[0]
     states, slopes = np.empty(5, np.int64), np.empty(5)
@@ -170,7 +144,6 @@ def _slips(
         wheel_speed = ground + state[states[4]] if in_state else wheel_speed_mps[n, i]
         traction = abs(wheel_speed) >= abs(ground)
         fastest = wheel_speed if traction else ground
-        slip[n, 0, i] = slip[n, 1, i] = np.nan
         if not (abs(fastest) >= MIN_SPEED_MPS and np.isfinite(wheel_speed)):
             continue
         size, sign = abs(fastest), np.sign(fastest)
@@ -185,8 +158,8 @@ def _slips(
             for m in range(5):
                 if states[j] >= 0 and states[m] >= 0:
                     variance += slopes[j] * cov[n, states[j], states[m]] * slopes[m]
-        slip[n, 0, i] = min(max((wheel_speed - ground) / size, -1.0), 1.0)
-        slip[n, 1, i] = np.sqrt(max(variance, 0.0))
+        slip[0, n, i] = min(max((wheel_speed - ground) / size, -1.0), 1.0)
+        slip[1, n, i] = np.sqrt(max(variance, 0.0))
 
 
 def wheel_speed_scatter_mps(robot: Robot) -> float:
@@ -241,10 +214,9 @@ def slip_figures(
     moving = speed > STEADY_SPEED_MPS
     steady = moving & started & (change < STEADY_CHANGE_MPS)
     ratio = slip.slip_ratio if rolling is None else slip.slip_ratio * rolling
-    peak = _of_known(np.max, np.abs(ratio[moving & ~steady]))
-    return SlipFigures(read_only(steady, np.bool_), _of_known(np.mean, ratio[steady]), peak)
-
-
-def _of_known(statistic: Callable[[Array], Any], slip: Array) -> float:
-    known = slip[np.isfinite(slip)]
-    return float(statistic(known)) if known.size else math.nan
+    in_steady, transient = (
+        part[np.isfinite(part)] for part in (ratio[steady], np.abs(ratio[moving & ~steady]))
+    )
+    mean = float(in_steady.mean()) if in_steady.size else math.nan
+    peak = float(transient.max()) if transient.size else math.nan
+    return SlipFigures(read_only(steady, np.bool_), mean, peak)

@@ -239,7 +239,6 @@ CASES: tuple[Case, ...] = (
             "simulate --robot agrimaro --terrain grass --scenario straight --duration 8 --camera-lost 4:6 "
             "--seed 5 --out raw",
             "estimate --data raw --filter encoder12 --out encoder12",
-            "estimate --data raw --filter slip14 --out slip14",
             "estimate --data raw --filter vio12 --out vio12",
             "estimate --data raw --filter vio15 --out vio15 --figures vio15/figures",
             "estimate --data raw --filter vio15 --tuning likelihood",

@@ -56,7 +56,7 @@ class TerrainConsistency(NamedTuple):
 
 def nees_by_group(estimate: Estimate) -> dict[str, float]:
     """Return the mean NEES of a simulated run, a state, of each group of states; empty without a truth."""
-    states = consistency_report(estimate.track, estimate.truth).states
+    states = consistency_report(estimate.track, estimate.truth)["states"]
     return {group.name: group.mean_per_dof for group in states if group.name != "all"}
 
 

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.feed import GNSS_ROWS, ROWS_OF_DRIVE, MeasurementTable, measurement_table
-from terrain.estimation.wheel_slip import STALE_AFTER_S, blind_slip, slip_figures, wheel_slip
+from terrain.estimation.wheel_slip import STALE_AFTER_S, slip_figures, wheel_slip
 from terrain.kinematics.camera import odometry_stream
 from terrain.records import ABSENT, RunLog, SlipTrack, StateTrack, Stream
 from terrain.robots import load_robot
@@ -142,7 +142,7 @@ def test_a_filter_of_encoders_alone_has_no_slip_but_a_figure_to_show():
     slip = wheel_slip(track, table, ROBOT)
     assert np.isnan(slip.slip_ratio).all()
     assert np.isnan(slip.slip_std).all()
-    np.testing.assert_allclose(blind_slip(track, table, ROBOT).slip_ratio, 0.001, atol=1e-6)
+    np.testing.assert_allclose(wheel_slip(track, table, ROBOT, blind=True).slip_ratio, 0.001, atol=1e-6)
     # with a slip ratio for a state too: nothing determines it
     more = make_track(
         np.tile([1.0, *[0.0] * 5, *[0.4] * 3], (5, 1)), (*WITHOUT, "slip_1_ratio", "b", "c"), age_s=np.inf
@@ -151,13 +151,12 @@ def test_a_filter_of_encoders_alone_has_no_slip_but_a_figure_to_show():
 
 
 @pytest.mark.parametrize("speed_name", ["speed_x_mps", "speed_mps"])
-def test_sides_of_a_skid_steered_robot(speed_name):
+def test_sides_of_a_skid_steered_robot(speed_name, monkeypatch):
+    monkeypatch.setattr(f"{wheel_slip.__module__}.wheel_speed_scatter_mps", lambda _: 0.01)
     half = HUSKY.track_m / 2
     track = make_track([0.9, 0.5], (speed_name, "yaw_rate_radps"), np.diag([1e-4, 4e-4]))
     left, right = 0.9 - 0.5 * half, 0.9 + 0.5 * half
-    slip = wheel_slip(
-        track, make_table(track, [left / 0.8, right * 0.9], HUSKY), HUSKY, wheel_speed_std_mps=0.01
-    )
+    slip = wheel_slip(track, make_table(track, [left / 0.8, right * 0.9], HUSKY), HUSKY)
     np.testing.assert_allclose(slip.slip_ratio, [[0.2, -0.1]])
     assert slip.wheels == ("left", "right")
     ground_std = np.sqrt(1e-4 + half**2 * 4e-4)
@@ -275,7 +274,7 @@ def test_figures_without_steady_or_moving_samples_are_nan():
 
 
 @pytest.mark.parametrize("states", [WITH_SLIP, WITHOUT])
-def test_slip_and_its_uncertainty_are_those_of_its_plain_form(states):
+def test_slip_and_its_uncertainty_are_those_of_its_plain_form(states, monkeypatch):
     """Slip by its definition; its variance by numerical differences of all that it depends on."""
     rng = np.random.default_rng(0)
     n, d = 300, len(states)
@@ -283,7 +282,8 @@ def test_slip_and_its_uncertainty_are_those_of_its_plain_form(states):
     root = rng.normal(0.0, 0.1, (d, d))
     wheel_speed_mps = rng.normal(0.0, 1.0, (n, 3)) * rng.choice([0.0, 0.02, 1.0, np.nan], (n, 3))
     track = make_track(mean, states, root @ root.T)
-    slip = wheel_slip(track, make_table(track, wheel_speed_mps), ROBOT, wheel_speed_std_mps=0.05)
+    monkeypatch.setattr(f"{wheel_slip.__module__}.wheel_speed_scatter_mps", lambda _: 0.05)
+    slip = wheel_slip(track, make_table(track, wheel_speed_mps), ROBOT)
 
     def plain(numbers, wheel):
         x, y = ROBOT.wheel_positions_m[wheel]

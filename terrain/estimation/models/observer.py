@@ -27,7 +27,7 @@ import numpy as np
 from terrain.errors import DataError
 from terrain.estimation.clocks import CLOCK_SET_S, Due, SampleQueue, check_channels
 from terrain.estimation.feed import TICK_S, places_among
-from terrain.estimation.filter import Filter, FilterModel, FilterSettings, Noise
+from terrain.estimation.filter import Filter, FilterModel, FilterSettings
 from terrain.records import GATED, REOPENED, USED, Array, RunLog
 from terrain.robots import Robot
 from terrain.status import StatusCode
@@ -70,8 +70,6 @@ CHANNELS: Mapping[str, tuple[str, ...]] = {
 }
 """Channels that are read of each stream beside the wheels; those that a log lacks are unknown."""
 
-_IMU_ROWS = ("yaw_rate_radps", "roll_rad", "pitch_rad", "accel_y_mps2")
-
 
 class ObserverStatus(StatusCode):
     """What the estimates of an observer are worth at a tick."""
@@ -106,13 +104,30 @@ class ObserverOutput(NamedTuple):
     status: int  #: number of an :class:`ObserverStatus`
 
 
-def _copies(memory: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what is remembered by name, with arrays, counters and tables of its own."""
-    mutable = np.ndarray, dict
-    return {name: value.copy() if isinstance(value, mutable) else value for name, value in memory.items()}
+class _WithMemory:
+    """What it remembers are its attributes; queues of samples are kept elsewhere."""
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return all that is remembered, for :meth:`restore`."""
+        return {name: _copy(value) for name, value in vars(self).items() if name != "queues"}
+
+    def restore(self, memory: Mapping[str, Any]) -> None:
+        """Go back to a snapshot."""
+        for name, value in memory.items():
+            own = getattr(self, name)
+            if isinstance(own, Filter):
+                own.state[:] = value
+            else:
+                setattr(self, name, _copy(value))
 
 
-class Observer(ABC):
+def _copy(value: Any) -> Any:
+    if isinstance(value, Filter):
+        return value.state.copy()
+    return value.copy() if isinstance(value, np.ndarray | dict) else value
+
+
+class Observer(ABC, _WithMemory):
     """An observer of slip in use.
 
     Attributes
@@ -132,21 +147,13 @@ class Observer(ABC):
     def step(self, row: Array, dt_s: float) -> ObserverOutput:
         """Take a row (m,) that comes a time after the one before, 0 at first; return what is known then."""
 
-    def snapshot(self) -> dict[str, Any]:
-        """Return all that is remembered, for :meth:`restore`."""
-        return _copies(vars(self))
-
-    def restore(self, memory: Mapping[str, Any]) -> None:
-        """Go back to a snapshot."""
-        vars(self).update(_copies(memory))
-
 
 class FilterObserver(Observer):
     """An observer that is a filter: a subclass makes its inputs of a row, and its slips of the state.
 
     Parameters
     ----------
-    model, noise, settings : of the filter
+    model, settings : of the filter
 
     Attributes
     ----------
@@ -154,8 +161,8 @@ class FilterObserver(Observer):
     age_s : (k,) time since each sensor was used, infinite before
     """
 
-    def __init__(self, model: FilterModel, noise: Noise, settings: FilterSettings) -> None:
-        self.filter = Filter(model, noise, settings)
+    def __init__(self, model: FilterModel, settings: FilterSettings) -> None:
+        self.filter = Filter(model, settings)
         self.name = model.name
         self.age_s = np.full(len(model.sensors), np.inf)
         self._time_s = 0.0
@@ -178,28 +185,21 @@ class FilterObserver(Observer):
         use = self.filter.use
         self.age_s += dt_s
         self.age_s[(use == USED) | (use == REOPENED)] = 0.0
-        use = use[:n_judged]
-        if (use == REOPENED).any():
+        if (use[:n_judged] == REOPENED).any():
             return ObserverStatus.RESET
-        return ObserverStatus.REJECTED if (use == GATED).any() else ObserverStatus.OK
+        return ObserverStatus.REJECTED if (use[:n_judged] == GATED).any() else ObserverStatus.OK
 
-    def snapshot(self) -> dict[str, Any]:
-        """Return all that is remembered, for :meth:`restore`."""
-        return super().snapshot() | {"filter": self.filter.state.copy()}
+    def read(self, function: Any, inputs: Array) -> tuple[Array, Array]:
+        """Return what a compiled function makes of state and parameters, and one standard deviation of each.
 
-    def restore(self, memory: Mapping[str, Any]) -> None:
-        """Go back to a snapshot."""
-        self.filter.state[:] = memory["filter"]
-        super().restore({name: value for name, value in memory.items() if name != "filter"})
-
-    def place(self, states: slice, values: Array, std: Array) -> None:
-        """Set some states, with standard deviations, whatever was known of them; others stay."""
-        mean, cov = self.filter.mean, self.filter.cov
-        mean[states], cov[states, :], cov[:, states] = values, 0.0, 0.0
-        cov[states, states] = np.diag(np.square(std))
+        It returns its values (n,), and their derivatives (n, d) by the state.
+        """
+        mean, by_x = function(self.filter.mean, np.append(self.filter.model.params, inputs))
+        variance = np.einsum("ij,jk,ik->i", by_x, self.filter.cov, by_x)
+        return mean, np.sqrt(np.maximum(variance, 0.0))
 
 
-class ObserverFeed:
+class ObserverFeed(_WithMemory):
     """Rows of an observer from the samples of a robot as they come.
 
     Parameters
@@ -218,12 +218,12 @@ class ObserverFeed:
     def __init__(self, robot: Robot, rows: tuple[str, ...], channels: Mapping[str, tuple[str, ...]]) -> None:
         wheels = channels.get("wheels", ())
         check_channels("wheels", robot.rate_channels, wheels)
-        self._speeds = [(wheels.index(name), name) for name in robot.rate_channels]
-        read = {stream: names for stream, names in CHANNELS.items() if channels.get(stream)}
+        self._speeds, self._rows = {name: wheels.index(name) for name in robot.rate_channels}, rows
         self.queues = {
-            stream: SampleQueue(places_among(names, channels[stream])) for stream, names in read.items()
+            stream: SampleQueue(places_among(names, channels[stream]))
+            for stream, names in CHANNELS.items()
+            if channels.get(stream)
         }
-        self._rows = rows
         self.dropped: Counter[str] = Counter()
         self.begin()
 
@@ -235,14 +235,6 @@ class ObserverFeed:
         self._held: dict[tuple[str, int], tuple[float, float]] = {}
         self._heading, self._n_behind = (-math.inf, math.nan), 0
 
-    def snapshot(self) -> dict[str, Any]:
-        """Return all that is remembered but the queues, for :meth:`restore`."""
-        return _copies(vars(self) | {"queues": None})
-
-    def restore(self, memory: Mapping[str, Any]) -> None:
-        """Go back to a snapshot."""
-        vars(self).update(_copies(memory) | {"queues": self.queues})
-
     def follows(self, time_s: float) -> int:
         """Return what a stamp of the wheels is: 1 taken, -1 of a clock that was set back, 0 not taken, and counted."""
         before_s = self._last_s
@@ -250,11 +242,9 @@ class ObserverFeed:
             self._n_behind = 0
             return 1
         self._n_behind = self._n_behind + 1 if time_s <= before_s - CLOCK_SET_S else 0
-        if self._n_behind >= CLOCK_SET_SAMPLES:
-            self.dropped["time: clock set"] += 1
-            return -1
-        self.dropped["wheels: stamp does not increase"] += 1
-        return 0
+        is_set = self._n_behind >= CLOCK_SET_SAMPLES
+        self.dropped["time: clock set" if is_set else "wheels: stamp does not increase"] += 1
+        return -1 if is_set else 0
 
     def tick(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> Array:
         """Return the row (m,) at a sample of the wheels, of the samples of other streams that came since the last."""
@@ -264,16 +254,13 @@ class ObserverFeed:
                 self.dropped["time: clock set"] += 1
                 self.queues[name].taken_s, self.queues[name].n_behind = -math.inf, 0
         row = dict.fromkeys(ROWS, math.nan)
-        row |= {name: float(wheels[column]) for column, name in self._speeds}
-        row["steer_front_rad"] = self._means("steering", time_s, due, last=True)[0]
-        row |= zip(_IMU_ROWS, self._means("imu", time_s, due), strict=True)
-        speeds = [row[name] for _, name in self._speeds]
-        row |= self._fix(time_s, sum(speeds) / len(speeds), due)
+        speeds = {name: float(wheels[column]) for name, column in self._speeds.items()}
+        row |= speeds | dict(zip(ROWS[7:], self._means("imu", time_s, due), strict=True))
+        (row["steer_front_rad"],) = self._means("steering", time_s, due, last=True)
+        row |= zip(ROWS[4:7], self._fix(time_s, sum(speeds.values()) / len(speeds), due), strict=True)
         return np.array([row[name] for name in self._rows])
 
-    def _means(
-        self, stream: str, time_s: float, due: Mapping[str, Due], *, last: bool = False
-    ) -> list[float]:
+    def _means(self, stream: str, time_s: float, due: Mapping[str, Due], last: bool = False) -> list[float]:
         """Return mean, or last, of what is known of each channel since the tick before; else the last known, held."""
         samples, means = [(stamp_s, sample.tolist()) for stamp_s, _, sample in due.get(stream, ())], []
         for k in range(len(CHANNELS[stream])):
@@ -282,8 +269,9 @@ class ObserverFeed:
                 self._held[stream, k] = known[-1]
             stamp_s, value = self._held.get((stream, k), (-math.inf, math.nan))
             if known and not last:
-                value = sum(value for _, value in known) / len(known)
-            means.append(value if time_s - stamp_s <= HELD_S or (known and not last) else math.nan)
+                means.append(sum(value for _, value in known) / len(known))
+            else:
+                means.append(value if time_s - stamp_s <= HELD_S else math.nan)
         return means
 
     def _known(self, stream: str, time_s: float, due: Mapping[str, Due]) -> tuple[float, list[float]] | None:
@@ -291,8 +279,7 @@ class ObserverFeed:
         last = None
         for stamp_s, _, values in due.get(stream, ()):
             sample = values.tolist()
-            needed = sample[:2] if stream == "gnss" else sample
-            if any(math.isnan(value) for value in needed):
+            if any(math.isnan(value) for value in (sample[:2] if stream == "gnss" else sample)):
                 continue
             if time_s - stamp_s > LATE_S:
                 self.dropped[f"{stream}: late"] += 1
@@ -302,7 +289,7 @@ class ObserverFeed:
                 last = (stamp_s, sample)
         return last
 
-    def _fix(self, time_s: float, speed_mps: float, due: Mapping[str, Due]) -> dict[str, float]:
+    def _fix(self, time_s: float, speed_mps: float, due: Mapping[str, Due]) -> tuple[float, float, float]:
         """Return position and heading of the last fix since the tick before, brought to this one."""
         pose, fix, heading = (self._known(name, time_s, due) for name in ("pose", "gnss", "compass"))
         if heading is not None:
@@ -312,14 +299,12 @@ class ObserverFeed:
         elif fix is not None:
             stamp_s, (x, y, _) = fix
             yaw = self._heading[1] if abs(stamp_s - self._heading[0]) <= TOGETHER_S else math.nan
-        elif heading is not None:
-            return {"yaw_rad": heading[1][0]}
         else:
-            return {}
+            return math.nan, math.nan, math.nan if heading is None else heading[1][0]
         moved = speed_mps * (time_s - stamp_s)
         if math.isfinite(moved) and math.isfinite(yaw):
             x, y = x + moved * math.cos(yaw), y + moved * math.sin(yaw)
-        return {"position_x_m": x, "position_y_m": y, "yaw_rad": yaw}
+        return x, y, yaw
 
 
 def rows_of(run: RunLog, robot: Robot, rows: tuple[str, ...]) -> tuple[Array, Array, dict[str, int]]:
@@ -342,9 +327,8 @@ def rows_of(run: RunLog, robot: Robot, rows: tuple[str, ...]) -> tuple[Array, Ar
     }
     for k, time_s in enumerate(wheels.time_s.tolist()):
         for name, queue in feed.queues.items():
-            new = slice(*edges[name][k : k + 2])
+            stream, new = run.streams[name], slice(*edges[name][k : k + 2])
             if new.start < new.stop:
-                stream = run.streams[name]
                 queue.push(stream.time_s[new], stream.values[new])
         follows = feed.follows(time_s)
         if follows < 0:
@@ -353,10 +337,8 @@ def rows_of(run: RunLog, robot: Robot, rows: tuple[str, ...]) -> tuple[Array, Ar
             due = {name: queue.take(time_s) for name, queue in feed.queues.items()}
             times.append(time_s)
             found.append(feed.tick(time_s, wheels.values[k], due))
-    dropped = {
-        f"{name}: {kind}": n for name, queue in feed.queues.items() for kind, n in queue.counts.items()
-    }
-    return np.array(times), np.array(found).reshape(len(found), len(rows)), dropped | feed.dropped
+    counts = {f"{name}: {kind}": n for name, queue in feed.queues.items() for kind, n in queue.counts.items()}
+    return np.array(times), np.array(found).reshape(len(found), len(rows)), counts | feed.dropped
 
 
 class ObserverTrack(NamedTuple):
@@ -386,9 +368,10 @@ def observe(observer: Observer, time_s: Array, rows: Array) -> ObserverTrack:
     """
     steps_s = np.diff(time_s, prepend=time_s[:1]).tolist()
     outputs = [observer.step(row, dt_s) for dt_s, row in zip(steps_s, rows, strict=True)]
-    n, d, k = len(time_s), len(observer.states), len(observer.slips)
+    d, k = len(observer.states), len(observer.slips)
     mean, std, slip, slip_std = (
-        np.array([output[i] for output in outputs]).reshape(n, size) for i, size in enumerate((d, d, k, k))
+        np.array([output[i] for output in outputs]).reshape(len(time_s), size)
+        for i, size in enumerate((d, d, k, k))
     )
     status = np.array([output.status for output in outputs], dtype=np.int64)
     return ObserverTrack(time_s, observer.states, observer.slips, mean, std, slip, slip_std, status)

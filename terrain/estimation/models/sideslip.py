@@ -48,7 +48,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.estimation.filter import FilterModel, FilterSettings, Noise, differentiate
+from terrain.estimation.filter import FilterModel, FilterSettings, differentiate
 from terrain.estimation.models.observer import (
     LONGEST_STEP_S,
     FilterObserver,
@@ -217,6 +217,23 @@ def _observe(x: Array, params: Array, z_hat: Array, h: Array) -> None:
         h[:, 5:7] = 0.0
 
 
+@njit
+def _outputs(x: Array, _dt: float, params: Array, y: Array) -> None:
+    """Write pose, yaw rate, lateral velocity, cornering stiffness and slip angles of the axles."""
+    y[:3] = x[:3]
+    y[3], y[4] = params[_SPEED] * x[3] / params[_BASE], params[_SPEED] * x[4]
+    y[5], y[6] = params[_C_FRONT] * (x[5] + x[6]), params[_C_REAR] * (x[5] - x[6])
+    sign = -1.0 if params[_SPEED] < 0.0 else 1.0
+    y[7], y[8] = slip_angles(x[3], x[4], params[_STEER], sign, params)
+
+
+@njit
+def _read(x: Array, params: Array) -> tuple[Array, Array]:
+    y, by_x = np.empty(9), np.empty((9, 7))
+    differentiate(_outputs, x, 0.0, params, y, by_x)
+    return y, by_x
+
+
 class Sideslip(FilterObserver):
     """An observer of sideslip of a car-like robot.
 
@@ -240,9 +257,9 @@ class Sideslip(FilterObserver):
 
     def __init__(self, robot: BicycleRobot, name: str, settings: SideslipSettings | None = None) -> None:
         self.settings = settings = SETTINGS[name] if settings is None else settings
-        self._nominal = np.array([robot.front_cornering_npr, robot.rear_cornering_npr])
-        geometry = (robot.wheelbase_m, robot.com_ahead_m, robot.com_behind_front_m)
-        params = (*geometry, robot.mass_kg, robot.yaw_inertia_kgm2, *self._nominal, settings.by_fixes)
+        nominal = (robot.front_cornering_npr, robot.rear_cornering_npr)
+        self._least_ratio = C_LOW_NPR / np.array(nominal)
+        self._geometry_m = geometry = (robot.wheelbase_m, robot.com_ahead_m, robot.com_behind_front_m)
         axles = np.sqrt([0.5 + 0.5 * STIFFNESS_CORRELATION, 0.5 - 0.5 * STIFFNESS_CORRELATION])
         self._stiffness_walk = (STIFFNESS_WALK_RATIO * axles) ** 2
         model = FilterModel(
@@ -257,8 +274,12 @@ class Sideslip(FilterObserver):
             ),
             propagate=_propagate,
             observe=_observe,
-            params=np.array(params, dtype=float),
-            initial_std=np.array([1e4, 1e4, math.pi, *FIRST_STD, *(STIFFNESS_STD_RATIO * axles)]),
+            params=np.array([*geometry, robot.mass_kg, robot.yaw_inertia_kgm2, *nominal, settings.by_fixes]),
+            process_variance=np.zeros(7),
+            measurement_variance=np.square(
+                [POSITION_STD_M, POSITION_STD_M, YAW_STD_RAD, GYRO_STD_RADPS, ACCEL_STD_MPS2]
+            ),
+            initial_variance=np.square([1e4, 1e4, math.pi, *FIRST_STD, *(STIFFNESS_STD_RATIO * axles)]),
             initial_mean=np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]),
             inputs=_INPUTS,
             references=("position",),
@@ -266,59 +287,76 @@ class Sideslip(FilterObserver):
             angle_states=("yaw_rad",),
             angle_rows=("yaw_rad",),
         )
-        std = (POSITION_STD_M, POSITION_STD_M, YAW_STD_RAD, GYRO_STD_RADPS, ACCEL_STD_MPS2)
-        super().__init__(
-            model, Noise(np.zeros(7), np.square(std)), FilterSettings(_GATE_PROBABILITY, RESET_S)
-        )
+        super().__init__(model, FilterSettings(_GATE_PROBABILITY, RESET_S))
         motion = ("yaw_rate_radps", "speed_y_mps", "cornering_front_npr", "cornering_rear_npr")
         self.states = (*_STATES[:3], *(motion if settings.by_dynamics else ()))
-        self._base_m, self._ahead_m, self._behind_m = geometry
         self._before: tuple[float, float] | None = None
         self._roll_rad, self._by_imu_alone = 0.0, settings.by_imu and not settings.by_fixes
-        self._output = self._read(0.0, 0.0, ObserverStatus.STARTING)
-
-    @property
-    def is_started(self) -> bool:
-        """Whether what the slip is seen by was measured: position and heading, or an IMU."""
-        return bool((self.age_s[2:].min() if self._by_imu_alone else self.age_s[:2].max()) < math.inf)
+        self._output = self._output_of(0.0, 0.0, ObserverStatus.STARTING)
 
     def step(self, row: Array, dt_s: float) -> ObserverOutput:
-        """Take a row of :data:`ROWS`; a roll that was never measured is that of level ground."""
+        """Take a row of :data:`ROWS`; a roll that was never measured is that of level ground.
+
+        It has started where what the slip is seen by was measured: position and heading, or an IMU.
+        """
+        settings, mean, (base_m, ahead_m, behind_m) = self.settings, self.filter.mean, self._geometry_m
         speed, steer, *_, rate, roll, accel = row.tolist()
-        if not (0.0 <= dt_s <= LONGEST_STEP_S and abs(speed) < FASTEST_MPS and abs(steer) < 0.5 * math.pi):
+        size, sign = abs(speed), -1.0 if speed < 0.0 else 1.0
+        if not (0.0 <= dt_s <= LONGEST_STEP_S and size < FASTEST_MPS and abs(steer) < 0.5 * math.pi):
             return self._hold(ObserverStatus.BAD_INPUT)
         if abs(roll) < 0.5 * math.pi:
             self._roll_rad = roll
-        stands, was_started = abs(speed) < STANDING_MPS, self.is_started
+        was_started = (self.age_s[2:].min() if self._by_imu_alone else self.age_s[:2].max()) < math.inf
+        stands, moves = size < STANDING_MPS, size >= settings.slowest_mps
         if stands and self.age_s[:2].max() < math.inf:
             if was_started and self._output.status == ObserverStatus.STARTING:
-                self._output = self._read(speed, steer, ObserverStatus.STANDING)
+                self._output = self._output_of(speed, steer, ObserverStatus.STANDING)
             return self._hold(ObserverStatus.STANDING if was_started else ObserverStatus.STARTING)
-        moves = abs(speed) >= self.settings.slowest_mps
-        z = np.append(row[X:RATE], [math.nan, math.nan])
-        if self.settings.by_imu and moves:
+        z, by_dynamics = np.append(row[X:RATE], [math.nan, math.nan]), settings.by_dynamics and moves
+        if settings.by_imu and moves:
             z[3] = rate if abs(rate) < FASTEST_RADPS else math.nan
             z[4] = accel if abs(accel) < MOST_MPS2 else math.nan
-        by_dynamics = self.settings.by_dynamics and moves
         force = speed * z[3] + GRAVITY_MPS2 * math.sin(self._roll_rad)
         is_excited = by_dynamics and abs(force) > EXCITED_MPS2
-        fix = self.advance(
-            dt_s,
-            z,
-            self._inputs(speed, steer, by_dynamics, is_excited),
-            self._walk(stands, speed, is_excited),
-        )
-        self._bound(steer, -1.0 if speed < 0.0 else 1.0)
-        status = (
-            ObserverStatus.UNEXCITED if self.settings.by_dynamics and not is_excited else ObserverStatus.OK
-        )
-        if (self.age_s[2:].min() if self._by_imu_alone else self.age_s[0]) > LOST_S:
-            status = ObserverStatus.PREDICTED
-        if stands:
-            status = ObserverStatus.STANDING
+        if self._before is None:  # before the first tick there was no slip
+            self._before = speed, steer
+            mean[3:5] = np.array([1.0, ahead_m / base_m]) * math.tan(steer)
+        speed_before, steer_before = self._before
+        if not by_dynamics or not speed * speed_before > 0.0 or abs(speed_before) < settings.slowest_mps:
+            speed_before = speed
+        self._before = speed, steer
+        inputs = (speed, steer, self._roll_rad, speed_before, steer_before, by_dynamics, is_excited)
+        walk = np.zeros(7)  # as standard deviations, but of the stiffness
+        if not stands:
+            walk[:3] = (POSITION_WALK_M, POSITION_WALK_M, YAW_WALK_RAD)
+            if not settings.by_fixes:
+                walk[:3] += np.array([size, size, size / base_m]) * SLIP_ERROR_RAD
+            arm = math.hypot(ahead_m, behind_m) / base_m
+            walk[3:5] = math.sqrt(2.0) * SLIP_WALK_RADPS, arm * SLIP_WALK_RADPS
+            if by_dynamics:
+                walk[3:5] = TURN_WALK_RADPS2 * base_m / size, SIDE_WALK_MPS2 / size
+            walk = np.square(walk)
+            if is_excited:
+                walk[5:] = self._stiffness_walk
+        fix = self.advance(dt_s, z, np.array(inputs, float), walk)
+        # bounds move the mean, the covariance stays
+        angles = np.arctan([mean[4] + behind_m / base_m * mean[3], mean[4] - ahead_m / base_m * mean[3]])
+        slips = sign * (angles - [steer, 0.0])
+        if np.abs(slips).max() > SLIP_MAX_RAD:
+            front, rear = np.tan([steer, 0.0] + sign * np.clip(slips, -SLIP_MAX_RAD, SLIP_MAX_RAD))
+            mean[3:5] = front - rear, rear + ahead_m / base_m * (front - rear)
+        ratios = np.clip([mean[5] + mean[6], mean[5] - mean[6]], self._least_ratio, C_HIGH_RATIO)
+        mean[5:] = ratios.mean(), 0.5 * (ratios[0] - ratios[1])
+        status = ObserverStatus.OK
         if fix is not ObserverStatus.OK:
             status = fix
-        self._output = self._read(speed, steer, status if was_started else ObserverStatus.STARTING)
+        elif stands:
+            status = ObserverStatus.STANDING
+        elif (self.age_s[2:].min() if self._by_imu_alone else self.age_s[0]) > LOST_S:
+            status = ObserverStatus.PREDICTED
+        elif settings.by_dynamics and not is_excited:
+            status = ObserverStatus.UNEXCITED
+        self._output = self._output_of(speed, steer, status if was_started else ObserverStatus.STARTING)
         return self._output
 
     def _hold(self, status: ObserverStatus) -> ObserverOutput:
@@ -326,75 +364,12 @@ class Sideslip(FilterObserver):
         self._output = self._output._replace(status=int(status))
         return self._output
 
-    def _inputs(self, speed: float, steer: float, by_dynamics: bool, is_excited: bool) -> Array:
-        """Return the inputs of the filter; before the first tick there was no slip."""
-        if self._before is None:
-            self._before = speed, steer
-            self.filter.mean[3:5] = np.array([1.0, self._ahead_m / self._base_m]) * math.tan(steer)
-        speed_before, steer_before = self._before
-        if not by_dynamics or not speed * speed_before > 0.0 or abs(speed_before) < self.settings.slowest_mps:
-            speed_before = speed
-        self._before = speed, steer
-        return np.array(
-            [speed, steer, self._roll_rad, speed_before, steer_before, by_dynamics, is_excited], float
-        )
-
-    def _walk(self, stands: bool, speed: float, is_excited: bool) -> Array:
-        """Return what each state changes by within a second, a variance."""
-        walk, size, settings = np.zeros(7), abs(speed), self.settings
-        if stands:
-            return walk
-        walk[:3] = (POSITION_WALK_M, POSITION_WALK_M, YAW_WALK_RAD)
-        if not settings.by_fixes:
-            walk[:3] += np.array([size, size, size / self._base_m]) * SLIP_ERROR_RAD
-        if settings.by_dynamics and size >= settings.slowest_mps:
-            walk[3:5] = TURN_WALK_RADPS2 * self._base_m / size, SIDE_WALK_MPS2 / size
-        else:
-            arm = math.hypot(self._ahead_m, self._behind_m) / self._base_m
-            walk[3:5] = math.sqrt(2.0) * SLIP_WALK_RADPS, arm * SLIP_WALK_RADPS
-        walk = np.square(walk)
-        if is_excited:
-            walk[5:] = self._stiffness_walk
-        return walk
-
-    def _bound(self, steer: float, sign: float) -> None:
-        """Keep slip angles and stiffness within their limits; bounds move the mean, the covariance stays."""
-        mean, base_m = self.filter.mean, self._base_m
-        slips = sign * (np.arctan(self._axles() @ mean[3:5]) - [steer, 0.0])
-        if np.abs(slips).max() > SLIP_MAX_RAD:
-            front, rear = np.tan([steer, 0.0] + sign * np.clip(slips, -SLIP_MAX_RAD, SLIP_MAX_RAD))
-            mean[3:5] = front - rear, rear + self._ahead_m / base_m * (front - rear)
-        axles = np.clip([mean[5] + mean[6], mean[5] - mean[6]], C_LOW_NPR / self._nominal, C_HIGH_RATIO)
-        mean[5:] = axles.mean(), 0.5 * (axles[0] - axles[1])
-
-    def _axles(self) -> Array:
-        """Return the matrix (2, 2) from r L / u and w / u to tan(d + s b_F) and tan(s b_R)."""
-        return np.array([[self._behind_m / self._base_m, 1.0], [-self._ahead_m / self._base_m, 1.0]])
-
-    def _read(self, speed: float, steer: float, status: ObserverStatus) -> ObserverOutput:
-        mean, cov, axles = self.filter.mean, self.filter.cov, self._axles()
-        sign, tangents = -1.0 if speed < 0.0 else 1.0, axles @ mean[3:5]
-        by_motion = axles / (1.0 + tangents**2)[:, None]
-        slip = sign * (np.arctan(tangents) - [steer, 0.0])
-        slip_std = np.sqrt(np.einsum("ij,jk,ik->i", by_motion, cov[3:5, 3:5], by_motion))
-        is_unknown = not self._by_imu_alone and not slip_std.max() < UNKNOWN_STD_RAD
-        if status == ObserverStatus.STARTING or is_unknown:
-            slip, slip_std = np.full(2, np.nan), np.full(2, np.nan)
-        pose, pose_std = np.array(mean[:3]), np.sqrt(cov.diagonal()[:3])
-        unknown = self.age_s[[0, 0, 1]] == np.inf
-        pose[unknown] = pose_std[unknown] = np.nan
-        if not self.settings.by_dynamics:
-            return ObserverOutput(pose, pose_std, slip, slip_std, int(status))
-        per_motion, mixed = np.array([speed / self._base_m, speed]), np.array([[1.0, 1.0], [1.0, -1.0]])
-        motion, motion_std = per_motion * mean[3:5], np.abs(per_motion) * np.sqrt(cov.diagonal()[3:5])
-        if status == ObserverStatus.STARTING:
-            motion, motion_std = np.full(2, np.nan), np.full(2, np.nan)
-        stiffness = self._nominal * (mixed @ mean[5:])
-        stiffness_std = self._nominal * np.sqrt(np.einsum("ij,jk,ik->i", mixed, cov[5:, 5:], mixed))
-        return ObserverOutput(
-            np.concatenate([pose, motion, stiffness]),
-            np.concatenate([pose_std, motion_std, stiffness_std]),
-            slip,
-            slip_std,
-            int(status),
-        )
+    def _output_of(self, speed: float, steer: float, status: ObserverStatus) -> ObserverOutput:
+        mean, std = self.read(_read, np.array([speed, steer, *np.zeros(5)]))
+        unknown = np.append(self.age_s[[0, 0, 1]] == np.inf, np.zeros(6, bool))
+        is_starting = status == ObserverStatus.STARTING
+        unknown[3:5] = is_starting
+        unknown[7:] = is_starting or (not self._by_imu_alone and not std[7:].max() < UNKNOWN_STD_RAD)
+        mean[unknown] = std[unknown] = np.nan
+        n = len(self.states)
+        return ObserverOutput(mean[:n], std[:n], mean[7:], std[7:], int(status))

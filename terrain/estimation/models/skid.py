@@ -54,7 +54,7 @@ from enum import IntEnum
 import numpy as np
 
 from terrain.estimation.feed import REST_ROW, REST_S, SIDE_ROWS, STANDING_MPS, TICK_S
-from terrain.estimation.filter import FilterModel, Noise
+from terrain.estimation.filter import FilterModel
 from terrain.kernels import filled, njit, numbers, record
 from terrain.records import Array
 from terrain.robots import Robot, SkidSteerRobot, as_drive
@@ -81,7 +81,7 @@ _STATES = (
 #: Rows of the table that the filter takes beside that of rest.
 WHEELS_AND_GYRO = (*SIDE_ROWS, "gyro_z_radps")
 
-_ROWS = (*WHEELS_AND_GYRO, REST_ROW)
+_ROWS, _SENSORS = (*WHEELS_AND_GYRO, REST_ROW), ("wheel_left", "wheel_right", "gyro", "rest")
 _X, _Y, _YAW, _V, _W, _TRACK, _BIAS, _DIFFERENCE = range(8)
 
 
@@ -145,9 +145,9 @@ def within_bounds(mean: Array, track_m: float) -> Array:
 
 
 def make_skid_filter(robot: Robot) -> FilterModel:
-    """Return the filter of a skid-steer robot; the effective track starts as the described one, hardly known.
+    """Return the filter of a skid-steer robot, with physical noise.
 
-    ``ConfigError`` where the robot is of another kind.
+    The effective track starts as the described one, hardly known.  ``ConfigError`` where the robot is of another kind.
 
     Examples
     --------
@@ -156,30 +156,23 @@ def make_skid_filter(robot: Robot) -> FilterModel:
     ()
     """
     as_drive(SkidSteerRobot, robot, "robot {name} has the drive {drive!r}: this filter is for 'skid_steer'")
-    mean = np.zeros(len(_STATES))
-    mean[_TRACK] = robot.track_m
+    track_m = robot.track_m
+    walk_std = np.array([1e-2, 1e-2, 1e-3, 0.5, 0.6, 0.02, 2e-4, 1.0])
     return FilterModel(
         name="skid",
         states=_STATES,
         rows=_ROWS,
-        sensors=tuple(
-            zip(("wheel_left", "wheel_right", "gyro", "rest"), ((row,) for row in _ROWS), strict=True)
-        ),
+        sensors=tuple((name, (row,)) for name, row in zip(_SENSORS, _ROWS, strict=True)),
         propagate=_propagate,
         observe=_observe,
-        params=np.array([robot.track_m]),
-        initial_std=np.array([1e-3, 1e-3, 1e-3, 1.0, 0.5, robot.track_m, BIAS_STD_RADPS, 1.0]),
-        initial_mean=mean,
+        params=np.array([track_m]),
+        process_variance=walk_std**2,
+        measurement_variance=np.square([0.06, 0.06, 0.01, 0.002]),
+        initial_variance=np.square([1e-3, 1e-3, 1e-3, 1.0, 0.5, track_m, BIAS_STD_RADPS, 1.0]),
+        initial_mean=np.array([0.0, 0.0, 0.0, 0.0, 0.0, track_m, 0.0, 0.0]),
         positions=_STATES[:2],
         angle_states=("yaw_rad",),
     )
-
-
-def skid_noise(robot: Robot) -> Noise:
-    """Return physical noise: walks of a second, and what samples scatter by; errors as :func:`make_skid_filter`."""
-    model = make_skid_filter(robot)
-    walk_std = np.array([1e-2, 1e-2, 1e-3, 0.5, 0.6, 0.02, 2e-4, 1.0])
-    return Noise(walk_std**2, np.array([0.06, 0.06, 0.01, 0.002]) ** 2, model.initial_std**2)
 
 
 #: Time constant of the means: longer than a wheel's measurement is late (0.3 s), shorter than a turn.

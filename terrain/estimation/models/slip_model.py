@@ -328,25 +328,33 @@ def write_slip_model(path: Path, model: SlipModel, robot: str) -> None:
         residuals:
           slip_std_ratio: 0.01
           ...
-        correlation: [[1.0, 0.1, ...], ...]
+        correlation:
+        - [1.0, 0.1, ...]
     """
     check_slip_model_file(path)
+
+    def rounded(value: float) -> float:
+        return float(f"{value:.{DIGITS}g}")
+
     std = np.sqrt(np.diag(model.covariance))
     scale = np.where(std > 0.0, std, 1.0)
     correlation = model.covariance / np.outer(scale, scale)
     np.fill_diagonal(correlation, 1.0)
     pairs = zip(PARAMETERS, model.vector, std, strict=True)
-    lines = [
-        "# Slip of a tracked robot on one ground, for terrain estimate --filter slip-odometry --slip-model.",
-        yaml.safe_dump({"robot": robot, "found": model.found}, sort_keys=False, width=math.inf).strip(),
-        "parameters:",
-        *(f"  {name}: {{value: {_text(value)}, std: {_text(error)}}}" for name, value, error in pairs),
-        "residuals:",
-        *(f"  {name}: {_text(getattr(model, name))}" for name in RESIDUALS),
-        "correlation:",
-        *(f"  - [{', '.join(_text(each) for each in row)}]" for row in correlation),
-    ]
-    atomic_write(path, "\n".join(lines) + "\n")
+    content = {
+        "robot": robot,
+        "found": model.found,
+        "parameters": {
+            name: {"value": rounded(value), "std": rounded(error)} for name, value, error in pairs
+        },
+        "residuals": {name: rounded(getattr(model, name)) for name in RESIDUALS},
+        "correlation": [[rounded(each) for each in row] for row in correlation],
+    }
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=math.inf)
+    title = (
+        "# Slip of a tracked robot on one ground, for terrain estimate --filter slip-odometry --slip-model."
+    )
+    atomic_write(path, f"{title}\n{text}")
 
 
 def check_slip_model_file(path: Path) -> None:
@@ -365,54 +373,41 @@ def read_slip_model(path: Path, robot: str) -> SlipModel:
     ConfigError
         if it cannot be read, lacks a parameter, has an unknown one or no number, or is of another robot.
     """
+
+    def finite(place: str, value: Any, least: float = -math.inf) -> float:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        if not is_number or value < least:
+            kind = "a finite number from zero up" if least == 0.0 else "a finite number"
+            raise ConfigError(f"{path.name}: {place} is {shown(value)}, {kind} is required")
+        return float(value)
+
     described = read_yaml(path)
     check_keys(path.name, described, ["robot", "found", "parameters", "residuals"], optional=("correlation",))
     if described["robot"] != robot:
         raise ConfigError(
             f"{path.name}: is the slip model of robot {shown(described['robot'])}, not {robot!r}"
         )
-    check_keys(f"{path.name}: parameters", described["parameters"], list(PARAMETERS))
+    known, n = described["parameters"], len(PARAMETERS)
+    check_keys(f"{path.name}: parameters", known, list(PARAMETERS))
     check_keys(f"{path.name}: residuals", described["residuals"], list(RESIDUALS))
-    values, stds = np.empty(len(PARAMETERS)), np.empty(len(PARAMETERS))
-    for k, name in enumerate(PARAMETERS):
-        place, entry = f"{path.name}: parameters: {name}", described["parameters"][name]
-        check_keys(place, entry, ["value", "std"])
-        values[k] = _number(f"{place}: value", entry["value"])
-        stds[k] = _number(f"{place}: std", entry["std"], least=0.0)
-    residuals = {
-        name: _number(f"{path.name}: residuals: {name}", described["residuals"][name], least=0.0)
-        for name in RESIDUALS
-    }
-    correlation = _correlation(f"{path.name}: correlation", described.get("correlation"))
+    for name in PARAMETERS:
+        check_keys(f"{path.name}: parameters: {name}", known[name], ["value", "std"])
+    values = np.array([finite(f"parameters: {name}: value", known[name]["value"]) for name in PARAMETERS])
+    stds = np.array([finite(f"parameters: {name}: std", known[name]["std"], 0.0) for name in PARAMETERS])
+    residuals = {name: finite(f"residuals: {name}", described["residuals"][name], 0.0) for name in RESIDUALS}
+    rows, correlation = described.get("correlation"), np.eye(n)
+    if rows is not None:
+        if (
+            not isinstance(rows, list)
+            or [len(row) if isinstance(row, list) else 0 for row in rows] != [n] * n
+        ):
+            raise ConfigError(f"{path.name}: correlation: {n} rows of {n} numbers are required")
+        correlation = np.array([[finite("correlation", each) for each in row] for row in rows])
+        is_one = np.abs(np.diag(correlation) - 1.0).max() <= ROUNDED
+        is_symmetric = np.allclose(correlation, correlation.T, atol=ROUNDED)
+        if not (is_one and is_symmetric) or np.linalg.eigvalsh(correlation)[0] < -ROUNDED:
+            raise ConfigError(
+                f"{path.name}: correlation: these are no correlations: 1 on the diagonal, symmetric, none beyond 1"
+            )
     covariance = correlation * np.outer(stds, stds)
     return model_of(values, covariance=covariance, found=str(described["found"]), **residuals)
-
-
-def _number(place: str, value: Any, least: float = -math.inf) -> float:
-    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    if not good or value < least:
-        raise ConfigError(
-            f"{place} is {shown(value)}, a finite number{' from zero up' if least == 0.0 else ''} is required"
-        )
-    return float(value)
-
-
-def _correlation(place: str, rows: Any) -> Array:
-    n = len(PARAMETERS)
-    if rows is None:
-        return np.eye(n)
-    is_table = isinstance(rows, list) and all(isinstance(row, list) and len(row) == n for row in rows)
-    if not is_table or len(rows) != n:
-        raise ConfigError(f"{place}: {n} rows of {n} numbers are required")
-    found = np.array([[_number(place, each) for each in row] for row in rows])
-    one = np.abs(np.diag(found) - 1.0).max() <= ROUNDED and np.allclose(found, found.T, atol=ROUNDED)
-    if not one or np.linalg.eigvalsh(found)[0] < -ROUNDED:
-        raise ConfigError(f"{place}: these are no correlations: 1 on the diagonal, symmetric, none beyond 1")
-    return found
-
-
-def _text(value: float) -> str:
-    """Return a number as YAML 1.1 reads it: with a point before an exponent."""
-    text = repr(float(f"{value:.{DIGITS}g}"))
-    mantissa, _, exponent = text.partition("e")
-    return text if not exponent or "." in mantissa else f"{mantissa}.0e{exponent}"

@@ -46,7 +46,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.errors import ConfigError
-from terrain.estimation.filter import FilterModel, FilterSettings, Noise, differentiate
+from terrain.estimation.filter import FilterModel, FilterSettings, differentiate
 from terrain.estimation.models.observer import (
     LONGEST_STEP_S,
     FilterObserver,
@@ -96,9 +96,10 @@ FILTER_SETTINGS = FilterSettings(gate_probability=0.999, reopen_after_s=1.0)
 """One fix in a thousand is left out; after a second of those that are rejected the position begins anew."""
 
 _D = 3 + N_PARAMETERS + 2
-_THETA = slice(3, 3 + N_PARAMETERS)
 _MODEL = slice(3, 3 + N_MODEL)
-_RESIDUALS = slice(_D - 2, _D)
+_LIMITS = (np.full(N_MODEL, -100.0), np.full(N_MODEL, 100.0))  # of the parameters while they are learned
+for _place, _low, _high in ((0, 0.0, 3.0), (TRACK_RATIO, 0.3, 10.0)):
+    _LIMITS[0][_place], _LIMITS[1][_place] = _low, _high
 _KNOWN_STD = 1e-6  # of what is taken as known: a filter has no state without a variance
 
 
@@ -173,15 +174,18 @@ def _observe(x: Array, params: Array, z_hat: Array, h: Array) -> None:
 
 
 @njit
-def _velocity_by(x: Array, _dt: float, params: Array, out: Array) -> None:
-    out[0], out[1], out[2] = velocity(x, params)
+def _outputs(x: Array, _dt: float, params: Array, y: Array) -> None:
+    """Write pose, V_x, V_y and w, and the parameters of the model."""
+    y[:3] = x[:3]
+    y[3], y[4], y[5] = velocity(x, params)
+    y[6:] = x[3 : 3 + N_MODEL]
 
 
 @njit
-def _velocity_slopes(x: Array, params: Array) -> tuple[Array, Array]:
-    motion, by_x = np.empty(3), np.empty((3, _D))
-    differentiate(_velocity_by, x, 0.0, params, motion, by_x)
-    return motion, by_x
+def _read(x: Array, params: Array) -> tuple[Array, Array]:
+    y, by_x = np.empty(6 + N_MODEL), np.empty((6 + N_MODEL, _D))
+    differentiate(_outputs, x, 0.0, params, y, by_x)
+    return y, by_x
 
 
 class SlipOdometry(FilterObserver):
@@ -238,57 +242,64 @@ class SlipOdometry(FilterObserver):
         residuals = np.array([model.slip_std_ratio, model.angle_std_rad])
         errors = (model.run_slip_std_ratio, model.run_angle_std_rad, settings.gyro_bias_std_radps)
         std = np.maximum([0.0, 0.0, 0.0, *prior, *errors, *residuals], _KNOWN_STD)
-        parameters = [
-            f"parameter_{name}_ratio" for name in (*PARAMETERS, "run_slip", "run_angle", "gyro_bias")
-        ]
-        states = (*FIX_ROWS, *parameters, "residual_slip_ratio", "residual_angle_ratio")
+        parameters = (*PARAMETERS, "run_slip", "run_angle", "gyro_bias")
+        process = np.zeros(_D)
+        process[-2:] = 2.0 * residuals**2 / correlation_s
+        fix_std = (settings.fix_std_m, settings.fix_std_m, settings.yaw_fix_std_rad)
         filter_model = FilterModel(
             name=name,
-            states=states,
+            states=(
+                *FIX_ROWS,
+                *(f"parameter_{parameter}_ratio" for parameter in parameters),
+                *("residual_slip_ratio", "residual_angle_ratio"),
+            ),
             rows=(*FIX_ROWS, "track_ratio"),
             sensors=(("position", FIX_ROWS[:2]), ("heading", FIX_ROWS[2:]), ("tracks", ("track_ratio",))),
             propagate=_propagate,
             observe=_observe,
             params=np.array([self._half_m, correlation_s]),
-            initial_std=std,
+            process_variance=process,
+            measurement_variance=np.square([*fix_std, settings.ratio_std]),
+            initial_variance=std**2,
             initial_mean=np.array([0.0, 0.0, 0.0, *model.vector, *np.zeros(5)]),
             inputs=_INPUTS,
             positions=FIX_ROWS[:2],
             angle_rows=FIX_ROWS[2:],
         )
-        process = np.zeros(_D)
-        process[_RESIDUALS] = 2.0 * residuals**2 / correlation_s
-        fix_std = (settings.fix_std_m, settings.fix_std_m, settings.yaw_fix_std_rad)
-        noise = Noise(process, np.square([*fix_std, settings.ratio_std]))
-        super().__init__(filter_model, noise, FILTER_SETTINGS)
+        super().__init__(filter_model, FILTER_SETTINGS)
         self.filter.cov[_MODEL, _MODEL] += model.covariance - np.diag(prior**2)
         self.rows = (*ROWS, *FIX_ROWS) if self._learns else ROWS
         self.states, self.slips = (*STATES, *(PARAMETERS if self._learns else ())), slips
         self._is_located, self._displacement_rad, self._tilt_rad = not self._learns, 0.0, (0.0, 0.0)
         self._fastest_mps = BLIND_MPS
-        self._output = self._read(np.zeros(6), 0.0, ObserverStatus.STARTING)
+        self._output = self._output_of(np.zeros(6), 0.0, ObserverStatus.STARTING)
 
     def step(self, row: Array, dt_s: float) -> ObserverOutput:
         """Take a row of :attr:`rows`."""
+        settings, mean, cov = self._settings, self.filter.mean, self.filter.cov
         left, right, gyro, roll, pitch = row[:5].tolist()
         if not (0.0 <= dt_s <= LONGEST_STEP_S and abs(left) <= FASTEST_MPS and abs(right) <= FASTEST_MPS):
-            if 0.0 < dt_s < math.inf:
-                self._widen(self._fastest_mps * dt_s)
-            return self._with_pose(ObserverStatus.BAD_INPUT)
-        settings, mean = self._settings, self.filter.mean
-        status, has_tilt = ObserverStatus.OK, abs(roll) <= 0.5 * math.pi and abs(pitch) <= 0.5 * math.pi
-        if has_tilt:
-            self._tilt_rad = roll, pitch
+            # the pose is less certain by a motion as fast as the tracks were
+            moved_m = self._fastest_mps * dt_s if 0.0 < dt_s < math.inf else 0.0
+            std = np.sqrt(cov.diagonal()[:3])
+            wider = std + moved_m / np.array([1.0, 1.0, self._half_m])
+            std = np.maximum(np.minimum(wider, [LOST_M, LOST_M, math.pi]), std)
+            cov[range(3), range(3)] = std**2
+            known_std = np.concatenate([std, self._output.std[3:]])
+            self._output = self._output._replace(std=known_std, status=int(ObserverStatus.BAD_INPUT))
+            return self._output
+        status = ObserverStatus.OK
         by_track = 2.0 * self._half_m * float(mean[3 + TRACK_RATIO])
         tracks, bias = (right - left) / by_track, float(mean[3 + GYRO_BIAS])
         if not abs(gyro) <= FASTEST_RADPS:
             status, gyro = (ObserverStatus.OK if math.isnan(gyro) else ObserverStatus.REJECTED), math.nan
         by_gyro = abs(gyro - bias - tracks) >= settings.gyro_threshold_radps
-        rate = gyro - bias if by_gyro else tracks
-        variance = (
-            settings.gyro_noise_radps**2 if by_gyro else 2.0 * (settings.encoder_noise_mps / by_track) ** 2
-        )
-        if not has_tilt:
+        rate, rate_variance = tracks, 2.0 * (settings.encoder_noise_mps / by_track) ** 2
+        if by_gyro:
+            rate, rate_variance = gyro - bias, settings.gyro_noise_radps**2
+        if abs(roll) <= 0.5 * math.pi and abs(pitch) <= 0.5 * math.pi:
+            self._tilt_rad = roll, pitch
+        else:
             status = ObserverStatus.PREDICTED
         self._fastest_mps = max(abs(left), abs(right), BLIND_MPS)
         stands = abs(left) <= settings.stand_mps and abs(right) <= settings.stand_mps
@@ -297,115 +308,77 @@ class SlipOdometry(FilterObserver):
             is_pushed = abs(rate) > settings.pushed_radps
             status = ObserverStatus.PUSHED if is_pushed else ObserverStatus.STANDING
             used = (0.0, 0.0, used[2] if is_pushed else math.nan)
-            variance = variance if is_pushed else 0.0
+            rate_variance = rate_variance if is_pushed else 0.0
         inputs = np.array([*used, *self._tilt_rad, self._displacement_rad])
-        fix = self._advance(row, dt_s, inputs, variance)
+        walk, z, variance = np.zeros(_D), np.full(4, np.nan), np.array(self.filter.model.measurement_variance)
+        walk[2] = rate_variance * dt_s
+        if not stands:
+            along = np.array([math.cos(mean[2]), math.sin(mean[2])])
+            walk[:2] = 0.5 * settings.encoder_noise_mps**2 * dt_s * along**2
+        fix = np.where(np.abs(row[5:8]) <= LOST_M, row[5:8], np.nan)
+        if self._learns:
+            if self._is_located:
+                z[:3] = fix
+            by_tracks = (used[1] - used[0]) / (2.0 * self._half_m)
+            if not stands:
+                walk[_MODEL] = self._prior**2 / settings.forget_s
+            if not stands and dt_s > 0.0 and abs(used[2]) > TURNING_RADPS and used[2] * by_tracks > 0.0:
+                z[3] = by_tracks / used[2]
+                variance[3] *= max(2.0 * self._model.correlation_s / dt_s, 1.0)
+        judged = self.advance(dt_s, z, inputs, walk, variance, n_judged=2)
+        if self._learns:
+            mean[_MODEL] = np.clip(mean[_MODEL], *_LIMITS)
+            if not self._is_located and np.isfinite(fix).all():
+                self._is_located = True
+                mean[:3], cov[:3, :], cov[:, :3] = fix, 0.0, 0.0
+                cov[:3, :3] = np.diag(variance[:3])
         if not stands:
             self._displacement_rad = next_displacement(
                 self._displacement_rad, (left, right), rate, self._length_m, dt_s
             )
         if not self._is_located:
             status = ObserverStatus.STARTING
-        elif fix is not ObserverStatus.OK:
-            status = fix
-        self._output = self._read(inputs, variance, status)
+        elif judged is not ObserverStatus.OK:
+            status = judged
+        self._output = self._output_of(inputs, rate_variance, status)
         return self._output
 
     @property
     def learned_model(self) -> SlipModel:
         """The slip model that was come to, with its covariance and the residuals assumed."""
-        known = {"slip_std_ratio": self._model.slip_std_ratio, "angle_std_rad": self._model.angle_std_rad}
-        covariance = self.filter.cov[_MODEL, _MODEL]
+        names = ("slip_std_ratio", "angle_std_rad", "correlation_s")
         return model_of(
             np.array(self.filter.mean[_MODEL]),
-            covariance=covariance,
-            correlation_s=self._model.correlation_s,
+            covariance=self.filter.cov[_MODEL, _MODEL],
             found="fixes while driving",
-            **known,
+            **{name: getattr(self._model, name) for name in names},
         )
 
-    def _advance(self, row: Array, dt_s: float, inputs: Array, rate_variance: float) -> ObserverStatus:
-        """Take a tick into the filter: what changed since the one before, fixes and the ratio of the yaw rates."""
-        settings, mean, walk = self._settings, self.filter.mean, np.zeros(_D)
-        z, variance = np.full(4, np.nan), np.array(self.filter.noise.measurement_variance)
-        left, right, gyro = inputs[:3].tolist()
-        moves, cos, sin = left != 0.0 or right != 0.0, math.cos(mean[2]), math.sin(mean[2])
-        walk[2] = rate_variance * dt_s
-        if moves:
-            walk[:2] = 0.5 * settings.encoder_noise_mps**2 * dt_s * np.array([cos * cos, sin * sin])
-        if self._learns:
-            fix = np.where(np.abs(row[5:8]) <= LOST_M, row[5:8], np.nan)
-            if self._is_located:
-                z[:3] = fix
-            tracks = (right - left) / (2.0 * self._half_m)
-            if moves:
-                walk[_MODEL] = self._prior**2 / settings.forget_s
-            if moves and dt_s > 0.0 and abs(gyro) > TURNING_RADPS and gyro * tracks > 0.0:
-                z[3] = tracks / gyro
-                variance[3] *= max(2.0 * self._model.correlation_s / dt_s, 1.0)
-        became = self.advance(dt_s, z, inputs, walk, variance, n_judged=2)
-        if self._learns:
-            mean[3] = min(max(mean[3], 0.0), 3.0)
-            mean[4 : 3 + TRACK_RATIO] = np.clip(mean[4 : 3 + TRACK_RATIO], -100.0, 100.0)
-            mean[3 + TRACK_RATIO] = min(max(mean[3 + TRACK_RATIO], 0.3), 10.0)
-            if not self._is_located and np.isfinite(fix).all():
-                self._is_located = True
-                self.place(slice(0, 3), fix, np.sqrt(variance[:3]))
-        return became
-
-    def _widen(self, moved_m: float) -> None:
-        """Widen the pose by a motion that was not measured: as fast as the tracks were, or :data:`BLIND_MPS`."""
-        cov = self.filter.cov
-        for i, (moved, most) in enumerate(
-            ((moved_m, LOST_M), (moved_m, LOST_M), (moved_m / self._half_m, math.pi))
-        ):
-            std = math.sqrt(cov[i, i])
-            cov[i, i] = max(min(std + moved, most), std) ** 2
-
-    def _with_pose(self, status: ObserverStatus) -> ObserverOutput:
-        """Return what was known, with the uncertainty of the pose as it is."""
-        std = np.array(self._output.std)
-        std[:3] = np.sqrt(self.filter.cov.diagonal()[:3])
-        self._output = self._output._replace(std=std, status=int(status))
-        return self._output
-
-    def _read(self, inputs: Array, rate_variance: float, status: ObserverStatus) -> ObserverOutput:
-        mean, cov, settings = self.filter.mean, self.filter.cov, self._settings
-        motion, by_state = _velocity_slopes(mean, np.concatenate([self.filter.model.params, inputs]))
-        variance = np.einsum("ij,jk,ik->i", by_state, cov, by_state)
-        belts, moves = inputs[:2], bool(inputs[:2].any())
-        variance += np.array([0.5 * settings.encoder_noise_mps**2 * moves, 0.0, rate_variance])
-        std = np.sqrt(np.maximum(np.concatenate([cov.diagonal()[:3], variance]), 0.0))
+    def _output_of(self, inputs: Array, rate_variance: float, status: ObserverStatus) -> ObserverOutput:
+        settings, belts, moves = self._settings, inputs[:2], bool(inputs[:2].any())
+        mean, std = self.read(_read, inputs)
+        std[3] = math.hypot(std[3], math.sqrt(0.5) * settings.encoder_noise_mps * moves)
+        std[5] = math.sqrt(std[5] ** 2 + rate_variance)
         slip, slip_std = np.full(3, np.nan), np.full(3, np.nan)
-        ground = motion[0] + np.array([-self._half_m, self._half_m]) * motion[2]
+        v_x, v_y, rate = mean[3:6].tolist()
+        ground = v_x + np.array([-self._half_m, self._half_m]) * rate
         fastest = np.maximum(np.abs(belts), np.abs(ground))
-        square, ahead = motion[0] ** 2 + motion[1] ** 2, abs(motion[0])
         if moves:
             known = fastest >= settings.min_speed_mps
             slip[:2][known] = np.clip((belts - ground)[known] / fastest[known], -1.0, 1.0)
             slip_std[:2][known] = std[3] / fastest[known]
+            square = v_x**2 + v_y**2
             if square >= settings.min_speed_mps**2:
-                slip[2] = math.atan2(motion[1], ahead)
-                slip_std[2] = math.hypot(ahead * std[4], motion[1] * std[3]) / square
-        parameter_std = np.sqrt(cov.diagonal()[_MODEL]) if self._learns else np.empty(0)
-        unknown = parameter_std > OBSERVED_RATIO * self._prior if self._learns else slice(0)
-        parameters = np.array(mean[_MODEL]) if self._learns else np.empty(0)
-        parameters[unknown] = parameter_std[unknown] = np.nan
-        n = len(self.slips)
-        return ObserverOutput(
-            np.concatenate([mean[:3], motion, parameters]),
-            np.concatenate([std, parameter_std]),
-            slip[:n],
-            slip_std[:n],
-            int(status),
-        )
+                slip[2] = math.atan2(v_y, abs(v_x))
+                slip_std[2] = math.hypot(abs(v_x) * std[4], v_y * std[3]) / square
+        unknown = np.append(np.zeros(6, bool), std[6:] > OBSERVED_RATIO * self._prior)
+        mean[unknown] = std[unknown] = np.nan
+        d, n = len(self.states), len(self.slips)
+        return ObserverOutput(mean[:d], std[:d], slip[:n], slip_std[:n], int(status))
 
 
 def plain_odometry(
-    name: str,
-    robot: TrackedRobot,
-    model: SlipModel | None = None,
-    settings: OdometrySettings = DEFAULTS,
+    name: str, robot: TrackedRobot, model: SlipModel | None = None, settings: OdometrySettings = DEFAULTS
 ) -> SlipOdometry:
     """Return one of the odometries that know no slip, or of turns alone; see the table of this module.
 
@@ -424,7 +397,6 @@ def plain_odometry(
     model = model or SlipModel()
     covariance = np.zeros((N_MODEL, N_MODEL))
     covariance[TRACK_RATIO, TRACK_RATIO] = TRACK_STD_RATIO**2
-    threshold = settings.gyro_threshold_radps or GYRODOMETRY_THRESHOLD_RADPS
     known = SlipModel(
         turning_exponent=model.turning_exponent if name == "endo" else 1.0,
         track_ratio=model.track_ratio if name == "encoder-odometry" else 1.0,
@@ -432,8 +404,10 @@ def plain_odometry(
         run_slip_std_ratio=UNKNOWN_SLIP_RATIO,
         run_angle_std_rad=UNKNOWN_ANGLE_RAD,
     )
-    if name != "endo":
-        settings = settings._replace(
-            gyro_threshold_radps=math.inf if name == "encoder-odometry" else threshold
-        )
+    threshold = {
+        "encoder-odometry": math.inf,
+        "gyrodometry": settings.gyro_threshold_radps or GYRODOMETRY_THRESHOLD_RADPS,
+        "endo": settings.gyro_threshold_radps,
+    }[name]
+    settings = settings._replace(gyro_threshold_radps=threshold)
     return SlipOdometry(robot, known, settings, name, SLIPS[:2] if name == "endo" else ())

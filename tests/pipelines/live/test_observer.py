@@ -182,7 +182,7 @@ def test_what_does_not_fit_is_refused_at_once(mower_model, swerve_model, grass):
     imu, wheels = {"imu": ("gyro_z_radps",)}, {"wheels": ("speed_left_mps",)}
     measured = {name: info.channels[name] for name in ("imu", "wheels")}
     another = simulate_run(AGRIMARO, "grass", "survey", 5, 8, duration_s=25.0)
-    filtered = ((grass, AGRIMARO, "vio15"), (another, AGRIMARO, "slip14"))
+    filtered = ((grass, AGRIMARO, "vio15"), (another, AGRIMARO, "encoder12"))
     refusals = (
         (lambda: Observer(mower_model, channels=imu | wheels), "requires 'accel_z_mps2' of the stream 'imu'"),
         (lambda: Observer(swerve_model, channels=measured), "of the stream 'estimator', which is neither"),
@@ -198,7 +198,7 @@ def test_what_does_not_fit_is_refused_at_once(mower_model, swerve_model, grass):
         ),
         (
             lambda: fitted_model([enriched(estimate_run(*each)) for each in filtered]),
-            "estimates of slip14 and vio15",
+            "estimates of encoder12 and vio15",
         ),
     )
     for make, sentence in refusals:

@@ -96,7 +96,7 @@ def test_a_bias_is_believed_less_with_time_and_never_less_than_without_it():
         (math.nan, ("agrimaro", "vio15"), False, False),
         (math.inf, ("agrimaro", "vio15"), False, False),
         (0.0, ("husky", "skid"), False, False),
-        (0.0, ("agrimaro", "slip14"), False, True),
+        (0.0, ("agrimaro", "vio12"), False, True),
     ],
 )
 def test_only_what_is_fresh_is_used(age_s, whose, biases, belief):

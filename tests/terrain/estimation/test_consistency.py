@@ -1,18 +1,20 @@
 """A right filter is consistent, its innovations are white, and noise that is off is found where it is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from model_draws import sample_from_model
 
 from terrain.errors import DataError
 from terrain.estimation.consistency import (
     consistency_report,
     innovations,
     nees,
-    sample_from_model,
     true_states,
 )
-from terrain.estimation.filter import FilterModel, FilterSettings, Noise, run_filter
-from terrain.estimation.models.swerve import default_noise, make_filter
+from terrain.estimation.filter import FilterModel, FilterSettings, run_filter
+from terrain.estimation.models.swerve import make_filter
 from terrain.kernels import njit
 from terrain.records import RunLog, StateTrack, Stream
 from terrain.robots import load_robot
@@ -35,6 +37,7 @@ def read(x, params, z_hat, h):
     h[0, 0], h[1, 1], h[1, 2] = 1.0, 1.0, 1.0
 
 
+WALK, SAMPLE = np.square([1e-3, 0.3, 0.01]), np.square([0.03, 0.02])
 TURNTABLE = FilterModel(
     name="turntable",
     states=("yaw_rad", "yaw_rate_radps", "gyro_bias_radps"),
@@ -43,16 +46,16 @@ TURNTABLE = FilterModel(
     propagate=turn,
     observe=read,
     params=np.zeros(1),
-    initial_std=np.array([1.0, 1.0, 0.1]),
+    process_variance=WALK,
+    measurement_variance=SAMPLE,
+    initial_variance=np.square([1.0, 1.0, 0.1]),
     angle_states=("yaw_rad",),
     angle_rows=("compass_rad",),
 )
-WALK, SAMPLE = np.array([1e-3, 0.3, 0.01]) ** 2, np.array([0.03, 0.02]) ** 2
-NOISE = Noise(WALK, SAMPLE)
 
 
-def turned(seed=0, n=4000, noise=NOISE):
-    return sample_from_model(TURNTABLE, noise, n, DT_S, np.random.default_rng(seed))
+def turned(seed=0, n=4000):
+    return sample_from_model(TURNTABLE, n, DT_S, np.random.default_rng(seed))
 
 
 def verdicts(entries):
@@ -62,31 +65,31 @@ def verdicts(entries):
 @pytest.mark.parametrize("seed", range(4))
 def test_a_filter_on_its_own_equations_is_consistent(seed):
     time_s, truth, z = turned(seed)
-    report = consistency_report(run_filter(TURNTABLE, NOISE, time_s, z), truth)
-    assert verdicts(report.sensors) == {"compass": "consistent", "gyro": "consistent"}
-    assert set(verdicts(report.states)) == {"yaw", "yaw_rate", "gyro_bias", "all"}
-    assert list(verdicts(report.states).values()).count("consistent") >= 3  # four bounds of 95 %
-    for entry in report.sensors:
+    report = consistency_report(run_filter(TURNTABLE, time_s, z), truth)
+    assert verdicts(report["sensors"]) == {"compass": "consistent", "gyro": "consistent"}
+    assert set(verdicts(report["states"])) == {"yaw", "yaw_rate", "gyro_bias", "all"}
+    assert list(verdicts(report["states"]).values()).count("consistent") >= 3  # four bounds of 95 %
+    for entry in report["sensors"]:
         assert entry.n_independent > 0.8 * entry.n  # innovations are white
-    assert {e.name: e for e in report.states}["yaw"].n_independent < 0.8 * 4000  # errors are not
+    assert {e.name: e for e in report["states"]}["yaw"].n_independent < 0.8 * 4000  # errors are not
 
 
 @pytest.mark.parametrize(("factor", "verdict"), [(1 / 3, "overconfident"), (3.0, "conservative")])
 def test_noise_that_is_off_is_found_where_it_is(factor, verdict):
     time_s, truth, z = turned()
-    off = Noise(WALK, SAMPLE * [1.0, factor])
-    report = consistency_report(run_filter(TURNTABLE, off, time_s, z), truth)
-    assert verdicts(report.sensors)["gyro"] == verdict
-    wrong = Noise(WALK * factor, SAMPLE * factor, np.array([1.0, 1.0, 0.1]) ** 2)
-    report = consistency_report(run_filter(TURNTABLE, wrong, time_s, z), truth)
-    assert verdicts(report.sensors) == {"compass": verdict, "gyro": verdict}
-    assert verdicts(report.states)["all"] == verdict
+    off = replace(TURNTABLE, measurement_variance=SAMPLE * [1.0, factor])
+    report = consistency_report(run_filter(off, time_s, z), truth)
+    assert verdicts(report["sensors"])["gyro"] == verdict
+    wrong = replace(TURNTABLE, process_variance=WALK * factor, measurement_variance=SAMPLE * factor)
+    report = consistency_report(run_filter(wrong, time_s, z), truth)
+    assert verdicts(report["sensors"]) == {"compass": verdict, "gyro": verdict}
+    assert verdicts(report["states"])["all"] == verdict
 
 
 def test_a_filter_that_leaves_out_what_does_not_fit_is_not_called_consistent():
     time_s, _, z = turned()
     z[np.random.default_rng(0).random(len(z)) < 0.05, 1] += 5.0
-    (compass, gyro) = consistency_report(run_filter(TURNTABLE, NOISE, time_s, z)).sensors
+    (compass, gyro) = consistency_report(run_filter(TURNTABLE, time_s, z))["sensors"]
     assert gyro.gated_fraction == pytest.approx(0.05, abs=0.015)
     assert (compass.verdict, gyro.verdict) == ("consistent", "overconfident")
 
@@ -95,11 +98,11 @@ def test_a_sensor_without_measurements_has_an_unknown_verdict():
     time_s, truth, z = turned(n=200)
     z[:, 0] = np.nan
     truth[:, 2] = np.nan
-    report = consistency_report(run_filter(TURNTABLE, NOISE, time_s, z), truth)
-    assert report.sensors[0].verdict == "unknown"
-    assert report.sensors[0].n == 0
-    assert np.isnan(report.sensors[0].mean_per_dof)
-    assert set(verdicts(report.states)) == {"yaw", "yaw_rate", "all"}
+    report = consistency_report(run_filter(TURNTABLE, time_s, z), truth)
+    assert report["sensors"][0].verdict == "unknown"
+    assert report["sensors"][0].n == 0
+    assert np.isnan(report["sensors"][0].mean_per_dof)
+    assert set(verdicts(report["states"])) == {"yaw", "yaw_rate", "all"}
 
 
 def test_nees_is_the_squared_error_over_its_covariance_with_angles_wrapped():
@@ -123,12 +126,11 @@ ROBOT = load_robot("agrimaro")
 
 def filtered(seed=0):
     model = make_filter("vio15", ROBOT)
-    noise = default_noise("vio15", ROBOT)
-    time_s, _, drawn = sample_from_model(model, noise, 1500, 0.02, np.random.default_rng(seed))
+    time_s, _, drawn = sample_from_model(model, 1500, 0.02, np.random.default_rng(seed))
     z = np.array(drawn)
     z[200:250, model.rows.index("camera_speed_x_mps")] = np.nan
-    track = run_filter(model, noise, time_s, z, FilterSettings(gate_probability=1.0))
-    return model, track, innovations(model, noise, track, z)
+    track = run_filter(model, time_s, z, FilterSettings(gate_probability=1.0))
+    return model, track, innovations(model, track, z)
 
 
 def test_scaled_innovations_have_unit_variance_and_no_memory():
@@ -150,11 +152,11 @@ def test_the_first_sensor_of_a_step_has_the_square_that_the_filter_kept():
 
 
 def test_the_first_row_after_a_gap_has_no_innovation():
-    model, noise = make_filter("vio15", ROBOT), default_noise("vio15", ROBOT)
-    time_s, _, z = sample_from_model(model, noise, 400, 0.02, np.random.default_rng(1))
+    model = make_filter("vio15", ROBOT)
+    time_s, _, z = sample_from_model(model, 400, 0.02, np.random.default_rng(1))
     time_s = np.where(np.arange(400) < 200, time_s, time_s + 6.0)
-    track = run_filter(model, noise, time_s, z)
-    found = innovations(model, noise, track, z[np.searchsorted(time_s, track.time_s)])
+    track = run_filter(model, time_s, z)
+    found = innovations(model, track, z[np.searchsorted(time_s, track.time_s)])
     after = int(np.flatnonzero(np.diff(track.time_s) > 1.0)[0]) + 1
     for value, std in found.values():
         assert np.isnan([value[after], std[after]]).all()

@@ -41,15 +41,13 @@ def test_slip_of_12_5_percent_is_found_by_15_states_and_read_low_by_the_thesis_o
 
 
 def test_encoders_alone_cannot_observe_slip_and_the_track_reports_it(straight):
-    for name in ("encoder12", "slip14"):
-        found = estimate_run(straight, ROBOT, name)
-        row = summarize(found)
-        assert row.slip_true_mean == pytest.approx(0.125, abs=0.004)
-        assert row.slip_observable is False
-        assert np.isnan(found.slip.slip_ratio).all()
-    blind = summarize(estimate_run(straight, ROBOT, "encoder12"))
-    assert blind.slip_mean == pytest.approx(0.0, abs=0.005)
-    assert np.isnan(blind.slip_std)
+    found = estimate_run(straight, ROBOT, "encoder12")
+    row = summarize(found)
+    assert row.slip_true_mean == pytest.approx(0.125, abs=0.004)
+    assert row.slip_observable is False
+    assert np.isnan(found.slip.slip_ratio).all()
+    assert row.slip_mean == pytest.approx(0.0, abs=0.005)
+    assert np.isnan(row.slip_std)
 
 
 def turned(run, angle_rad):
@@ -128,7 +126,7 @@ def test_a_wheel_without_samples_has_no_slip(straight, stream, channel):
 
 
 def test_unknown_filters_and_tunings_are_refused_in_one_sentence(straight):
-    assert set(FILTERS) == {"encoder12", "slip14", "vio12", "vio15", "skid"}
+    assert set(FILTERS) == {"encoder12", "vio12", "vio15", "skid"}
     with pytest.raises(ConfigError, match="'skid' is not for robot agrimaro"):
         estimate_run(straight, ROBOT, "skid")
     with pytest.raises(ConfigError, match="no tuning 'best'"):

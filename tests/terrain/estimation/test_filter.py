@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from model_draws import sample_from_model
 
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.consistency import sample_from_model
-from terrain.estimation.filter import Filter, FilterModel, FilterSettings, Noise, run_filter
+from terrain.estimation.filter import Filter, FilterModel, FilterSettings, run_filter
 from terrain.kernels import njit
 from terrain.records import ABSENT, GATED, REOPENED, USED
 
@@ -47,6 +47,10 @@ def see(x, params, z_hat, h):
     h[4, 0] = 1.0
 
 
+WALK = np.diag([1e-3, 1e-3, 1e-2, 0.05, 0.1]) ** 2
+WALK[3, 4] = WALK[4, 3] = 0.5 * 0.05 * 0.1
+
+
 def flight():
     return FilterModel(
         name="flight",
@@ -60,7 +64,9 @@ def flight():
         propagate=fly,
         observe=see,
         params=np.array([30.0, 10.0]),
-        initial_std=np.array([0.5, 0.5, 0.1, 0.3, 0.2]),
+        process_variance=WALK,
+        measurement_variance=np.square([0.5, 0.01, 0.05, 0.05, 0.1]),
+        initial_variance=np.square([0.5, 0.5, 0.1, 0.3, 0.2]),
         initial_mean=np.array([0.0, 0.0, 0.0, 1.0, 0.0]),
         references=("fix",),
         positions=("position_x_m", "position_y_m"),
@@ -70,35 +76,31 @@ def flight():
 
 
 FLIGHT = flight()
-WALK = np.diag([1e-3, 1e-3, 1e-2, 0.05, 0.1]) ** 2
-WALK[3, 4] = WALK[4, 3] = 0.5 * 0.05 * 0.1
-FLIGHT_NOISE = Noise(WALK, np.array([0.5, 0.01, 0.05, 0.05, 0.1]) ** 2)
 
 
 @pytest.fixture(scope="module")
 def flown():
-    return sample_from_model(FLIGHT, FLIGHT_NOISE, 600, DT_S, np.random.default_rng(0))
+    return sample_from_model(FLIGHT, 600, DT_S, np.random.default_rng(0))
 
 
-def dense_filter(model, noise, time_s, z, wrapped=()):
+def dense_filter(model, time_s, z, wrapped=()):
     """The textbook: all rows at once, in Joseph form; NaN left out.  Yields x, P, NIS and log likelihood."""
     d, m = len(model.states), len(model.rows)
-    x, p = model.initial_mean.copy(), np.diag(model.initial_std**2)
+    x, p = model.initial_mean.copy(), model.initial_variance.copy()
     params = model.params.copy()
-    r_of = np.broadcast_to(noise.measurement_variance, z.shape)
     for n, now in enumerate(time_s):
         if n:
             dt = now - time_s[n - 1]
             x_next, f = np.zeros(d), np.zeros((d, d))
             model.propagate(x, dt, params, x_next, f)
-            x, p = x_next, f @ p @ f.T + noise.process_variance * dt
+            x, p = x_next, f @ p @ f.T + model.process_variance * dt
         z_hat, h = np.zeros(m), np.zeros((m, d))
         model.observe(x, params, z_hat, h)
         rows = np.flatnonzero(np.isfinite(z[n]))
         nu = z[n] - z_hat
         for i in wrapped:
             nu[i] = np.angle(np.exp(1j * nu[i]))
-        nu, h, r = nu[rows], h[rows], np.diag(r_of[n, rows])
+        nu, h, r = nu[rows], h[rows], np.diag(model.measurement_variance[rows])
         s = h @ p @ h.T + r
         k = np.linalg.solve(s, h @ p).T
         x = x + k @ nu
@@ -114,13 +116,13 @@ def test_rows_one_by_one_equal_the_textbook_all_at_once(flown, share_missing):
     rng = np.random.default_rng(1)
     z = np.where(rng.random(z.shape) < share_missing, np.nan, z)
     time_s = time_s + rng.uniform(0, 0.9 * DT_S, time_s.size)  # irregular
-    track = run_filter(FLIGHT, FLIGHT_NOISE, time_s, z, ALL_BELIEVED)
-    x, p, nis, likelihood = zip(*dense_filter(FLIGHT, FLIGHT_NOISE, time_s, z, wrapped=[1]), strict=True)
+    track = run_filter(FLIGHT, time_s, z, ALL_BELIEVED)
+    x, p, nis, likelihood = zip(*dense_filter(FLIGHT, time_s, z, wrapped=[1]), strict=True)
     np.testing.assert_allclose(track.mean, x, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(track.cov, p, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(np.nansum(track.nis, axis=1), nis, rtol=1e-9)
     assert track.log_likelihood == pytest.approx(sum(likelihood), rel=1e-9)
-    unkept = Filter(FLIGHT, FLIGHT_NOISE, ALL_BELIEVED).run(time_s, z, keep=False)
+    unkept = Filter(FLIGHT, ALL_BELIEVED).run(time_s, z, keep=False)
     assert unkept.likelihood.sum() == pytest.approx(track.log_likelihood, rel=1e-12)
     assert (track.cov == track.cov.transpose(0, 2, 1)).all()
     np.testing.assert_array_equal(track.nis_dof.sum(axis=1), np.isfinite(z).sum(axis=1))
@@ -150,7 +152,9 @@ def carriage(**changes):
             propagate=drift,
             observe=fix,
             params=np.zeros(1),
-            initial_std=np.array([1.0, 1.0]),
+            process_variance=np.square([1e-3, 0.1]),
+            measurement_variance=np.square([0.05, 0.05]),
+            initial_variance=np.ones(2),
             references=("rate",),
             positions=("position_m",),
         ),
@@ -159,11 +163,10 @@ def carriage(**changes):
 
 
 CARRIAGE = carriage()
-CARRIAGE_NOISE = Noise(np.array([1e-3, 0.1]) ** 2, np.array([0.05, 0.05]) ** 2)
 
 
 def ridden(n=400, seed=0):
-    return sample_from_model(CARRIAGE, CARRIAGE_NOISE, n, DT_S, np.random.default_rng(seed))
+    return sample_from_model(CARRIAGE, n, DT_S, np.random.default_rng(seed))
 
 
 def spoilt(seed=0):
@@ -184,12 +187,11 @@ def spoilt(seed=0):
 
 def test_sample_by_sample_equals_batch_bit_for_bit():
     time_s, z = spoilt()
-    r = np.tile(CARRIAGE_NOISE.measurement_variance, (time_s.size, 1))
+    r = np.tile(CARRIAGE.measurement_variance, (time_s.size, 1))
     r[::3, 0] *= 4
     r[7, 1] = np.nan
-    by_sample = Noise(CARRIAGE_NOISE.process_variance, r)
-    track = run_filter(CARRIAGE, by_sample, time_s, z)
-    session, taken = Filter(CARRIAGE, by_sample), []
+    track = run_filter(CARRIAGE, time_s, z, variance=r)
+    session, taken = Filter(CARRIAGE), []
     for k in range(time_s.size):
         if session.step(time_s[k], z[k], r[k]) and (not taken or time_s[k] > taken[-1][0]):
             state = session.state[0].copy()
@@ -207,7 +209,7 @@ def test_sample_by_sample_equals_batch_bit_for_bit():
 
 def test_every_fault_is_counted_by_its_name():
     time_s, z = spoilt()
-    track = run_filter(CARRIAGE, CARRIAGE_NOISE, time_s, z)
+    track = run_filter(CARRIAGE, time_s, z)
     assert np.isfinite(track.mean).all()
     assert np.isfinite(track.cov).all()
     assert (np.diff(track.time_s) > 0).all()
@@ -228,9 +230,9 @@ def test_a_lone_bad_stamp_costs_its_own_row_only():
     for bad in (1e9, -1e9, 30.0, np.nan, np.inf):
         stamps = time_s.copy()
         stamps[200] = bad
-        track = run_filter(CARRIAGE, CARRIAGE_NOISE, stamps, z)
+        track = run_filter(CARRIAGE, stamps, z)
         np.testing.assert_array_equal(track.time_s, np.delete(time_s, 200))
-        whole = run_filter(CARRIAGE, CARRIAGE_NOISE, np.delete(time_s, 200), np.delete(z, 200, axis=0))
+        whole = run_filter(CARRIAGE, np.delete(time_s, 200), np.delete(z, 200, axis=0))
         np.testing.assert_array_equal(track.mean, whole.mean)
         assert sum(track.dropped.values()) - sum(whole.dropped.values()) == 1
 
@@ -239,7 +241,7 @@ def test_a_gap_is_not_integrated_over_and_leaves_positions_where_they_were():
     time_s, _, z = ridden()
     z[300:, 0] = np.nan  # nothing tells the place afterwards
     time_s[300:] += 100.0
-    track = run_filter(CARRIAGE, CARRIAGE_NOISE, time_s, z)
+    track = run_filter(CARRIAGE, time_s, z)
     assert track.dropped["clock jump"] == 1
     np.testing.assert_array_equal(track.time_s, np.delete(time_s, 300))
     assert track.mean[300, 0] == track.mean[299, 0]
@@ -251,7 +253,7 @@ def test_a_gap_is_not_integrated_over_and_leaves_positions_where_they_were():
 def test_a_sensor_that_was_rejected_is_believed_once_a_second():
     time_s, _, z = ridden(600)
     z[100:300, 1] += 2.0  # 40 standard deviations, for 4 s
-    track = run_filter(CARRIAGE, CARRIAGE_NOISE, time_s, z)
+    track = run_filter(CARRIAGE, time_s, z)
     use = track.use[:, 1]
     reopened = np.flatnonzero(use == REOPENED)
     assert (use[100:150] == GATED).all()
@@ -266,13 +268,12 @@ def test_a_sensor_that_was_rejected_is_believed_once_a_second():
 def test_angles_meet_across_the_seam():
     time_s, truth, z = sample_from_model(
         dataclasses.replace(FLIGHT, initial_mean=np.array([0.0, 0, 3.1, 1.0, 0.6])),
-        FLIGHT_NOISE,
         600,
         DT_S,
         np.random.default_rng(3),
     )
     model = dataclasses.replace(FLIGHT, initial_mean=np.array([0.0, 0, -3.1, 1.0, 0.5]))
-    track = run_filter(model, FLIGHT_NOISE, time_s, z)
+    track = run_filter(model, time_s, z)
     assert (np.abs(track.state("yaw_rad")) <= np.pi).all()
     error = np.angle(np.exp(1j * (track.state("yaw_rad") - truth[:, 2])))
     assert np.abs(error[50:]).max() < 0.1
@@ -280,9 +281,9 @@ def test_angles_meet_across_the_seam():
 
 def test_a_measurement_beside_which_the_noise_is_lost_leaves_a_variance():
     """P0 = 1e16 R: s = h P h' + R is h P h' in double precision, and P - K s K' would be zero."""
-    model = carriage(initial_std=np.array([1e6, 1e6]))
-    noise = Noise(np.zeros(2), np.array([1e-2, 1e-2]) ** 2)
-    track = run_filter(model, noise, np.arange(3.0) / 50, np.ones((3, 2)))
+    noise = {"process_variance": np.zeros(2), "measurement_variance": np.square([1e-2, 1e-2])}
+    model = carriage(initial_variance=np.array([1e12, 1e12]), **noise)
+    track = run_filter(model, np.arange(3.0) / 50, np.ones((3, 2)))
     np.testing.assert_allclose(track.std("speed_mps"), 1e-2 / np.sqrt([1, 2, 3]), rtol=1e-3)
     assert track.dropped == {}
 
@@ -307,7 +308,7 @@ def test_estimates_stay_finite_for_arbitrary_measurements(rows, repeats, gate):
     time_s = np.repeat([dt for _, dt in rows], repeats)
     with np.errstate(all="ignore"):
         time_s = np.cumsum(np.where(np.isfinite(time_s), time_s, DT_S)) + np.arange(len(z)) * DT_S
-    track = run_filter(FLIGHT, FLIGHT_NOISE, time_s, z, FilterSettings(gate_probability=gate))
+    track = run_filter(FLIGHT, time_s, z, FilterSettings(gate_probability=gate))
     assert np.isfinite(track.mean).all()
     assert np.isfinite(track.cov).all()
     assert (track.cov.diagonal(axis1=1, axis2=2) > 0).all()
@@ -317,69 +318,42 @@ def test_estimates_stay_finite_for_arbitrary_measurements(rows, repeats, gate):
 
 
 def test_a_log_may_be_empty_or_end_at_once():
-    none = run_filter(CARRIAGE, CARRIAGE_NOISE, np.zeros(0), np.zeros((0, 2)))
+    none = run_filter(CARRIAGE, np.zeros(0), np.zeros((0, 2)))
     assert (none.mean.shape, none.log_likelihood) == ((0, 2), 0.0)
-    one = run_filter(CARRIAGE, CARRIAGE_NOISE, [5.0], [[np.nan, np.nan]])
+    one = run_filter(CARRIAGE, [5.0], [[np.nan, np.nan]])
     np.testing.assert_array_equal(one.cov[0], np.eye(2))
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"process_variance": np.ones((2, 3))}, r"process_variance has shape \(2, 3\), \(d,\) or \(d, d\)"),
-        ({"process_variance": [[1.0, 0.5], [0.0, 1.0]]}, "process_variance is not symmetric"),
-        ({"process_variance": [1.0, -1.0]}, "process_variance is not positive semidefinite"),
-        ({"process_variance": [1.0, np.inf]}, "process_variance holds a value that is not finite"),
-        ({"initial_variance": [1.0, 0.0]}, "initial_variance is not positive definite: its smallest"),
-        ({"measurement_variance": [1.0, 0.0]}, r"measurement_variance \[1.0, 0.0\] must be above zero"),
-        ({"measurement_variance": [[1.0, 0.5], [0.5, 2.0]]}, "rows are taken as independent, give"),
-        ({"measurement_variance": np.ones((1, 2, 2))}, r"measurement_variance has shape \(1, 2, 2\)"),
-    ],
-)
-def test_invalid_noise_is_refused(given, message):
-    fine = {"process_variance": np.zeros(2), "measurement_variance": np.ones(2)}
-    with pytest.raises(ConfigError, match=message):
-        Noise(**(fine | given))
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"states": ("position_m", "speed")},
-            "filter carriage: state or row 'speed' does not end in a known unit",
-        ),
-        ({"initial_std": np.array([1.0, 0.0])}, "initial_std .* must be above zero"),
-        ({"initial_mean": np.zeros(3)}, r"initial_mean has shape \(3,\), \(2,\) is needed"),
-        ({"states": ("position_m", "position_m")}, "name one of them twice"),
+        ({"process_variance": np.ones((2, 3))}, r"process_variance has shape \(2, 3\), finite \(2, 2\)"),
+        ({"process_variance": [1.0, np.inf]}, "process_variance has shape .*, finite"),
+        ({"process_variance": [1.0, -1.0]}, "process_variance is no covariance: its least eigenvalue is -1"),
+        ({"initial_variance": [1.0, 0.0]}, "initial_variance is no covariance"),
+        ({"measurement_variance": [1.0, 0.0]}, "measurement_variance must be above zero"),
+        ({"measurement_variance": np.ones(3)}, r"measurement_variance has shape \(3,\), finite \(2,\)"),
+        ({"initial_mean": np.zeros(3)}, r"initial_mean has shape \(3,\), finite \(2,\) is needed"),
+        ({"states": ("position_m", "speed")}, "state or row 'speed' does not end in a known unit"),
+        ({"states": ("position_m", "position_m")}, "have one twice"),
         ({"sensors": (("place", ("place_m",)),)}, "its sensors must hold every row once"),
-        ({"references": ("camera",)}, "references name 'camera', which is none of place, rate"),
+        ({"references": ("camera",)}, "references name {'camera'}, none of place, rate"),
         ({"observe": drift}, "observe must be @njit, and take"),
         ({"propagate": print}, "propagate must be @njit, and take"),
     ],
 )
 def test_invalid_models_are_refused(changes, message):
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(ConfigError, match=f"filter carriage: .*{message}"):
         carriage(**changes)
 
 
-@pytest.mark.parametrize(
-    ("noise", "z", "message"),
-    [
-        (CARRIAGE_NOISE, np.zeros((3, 4)), r"filter carriage: z has shape \(3, 4\), \(3, 2\) is needed"),
-        (Noise(np.ones(3), np.ones(2)), np.zeros((3, 2)), "process_variance is for 3 states, it has 2"),
-        (Noise(np.ones(2), np.ones(3)), np.zeros((3, 2)), "measurement_variance is for 3 rows, it has 2"),
-        (Noise(np.ones(2), np.ones((4, 2))), np.zeros((3, 2)), r"measurement_variance has shape \(4, 2\)"),
-    ],
-)
-def test_noise_and_measurements_of_another_size_are_refused(noise, z, message):
-    with pytest.raises(DataError, match=message):
-        run_filter(CARRIAGE, noise, np.arange(3.0), z)
-
-
-def test_invalid_settings_are_refused():
-    with pytest.raises(ConfigError, match="reopen_after_s is 0, seconds above zero are required"):
-        FilterSettings(reopen_after_s=0)
+def test_measurements_of_another_size_are_refused():
+    for z, variance, message in (
+        (np.zeros((3, 4)), None, r"z has shape \(3, 4\), \(3, 2\) is needed"),
+        (np.zeros((3, 2)), np.ones((4, 2)), r"variance has shape \(4, 2\)"),
+    ):
+        with pytest.raises(DataError, match=f"filter carriage: {message}"):
+            run_filter(CARRIAGE, np.arange(3.0), z, variance=variance)
 
 
 stamp_steps = st.one_of(st.floats(-0.05, 0.1), st.sampled_from([0.0, 0.02, 3.0, -3.0, np.nan, np.inf, 1e300]))
@@ -388,9 +362,8 @@ stamp_steps = st.one_of(st.floats(-0.05, 0.1), st.sampled_from([0.0, 0.02, 3.0, 
 @settings(deadline=None, max_examples=30)
 @given(st.lists(stamp_steps, min_size=1, max_size=30), st.integers(0, 9))
 def test_a_snapshot_goes_on_as_the_filter_it_was_taken_of(steps, seed):
-    model, rng = flight(), np.random.default_rng(seed)
-    noise = Noise(np.full(5, 0.01), np.full(5, 0.01))
-    session, other, last_s = Filter(model, noise), Filter(model, noise), 0.0
+    rng = np.random.default_rng(seed)
+    session, other, last_s = Filter(FLIGHT), Filter(FLIGHT), 0.0
     for step_s in steps:
         time_s = last_s + step_s
         last_s = time_s if abs(step_s) < 10.0 else last_s

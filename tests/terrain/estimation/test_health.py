@@ -145,11 +145,3 @@ def test_sound_sensors_stay_fresh(name, terrain):
     assert len(after) > 200
     assert (after <= Health.LATE).all()
     assert (after == Health.FRESH).mean() > 0.999
-
-
-def test_sound_sensors_stay_fresh_by_a_filter_without_biases():
-    estimator = LiveFilter(ROBOT, "slip14")
-    assert not any("bias" in state for state in estimator.states)
-    found = np.array([seen.health for sample in samples() for seen in estimator.step(sample.readings)])
-    assert len(found) > 600
-    assert (found == Health.FRESH).all()

@@ -12,14 +12,14 @@ from terrain.errors import ConfigError
 from terrain.estimation.clocks import QUEUE
 from terrain.estimation.estimate import estimate_run
 from terrain.estimation.feed import GNSS_ROWS, ROWS, measurement_table
-from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, FilterSettings, Noise, run_filter
+from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, FilterSettings, run_filter
 from terrain.estimation.live import CHANNELS, REWIND_S, LiveFilter, LiveObserver
 from terrain.estimation.models.choice import OBSERVERS, make_observer
 from terrain.estimation.models.observer import CHANNELS as OBSERVED
 from terrain.estimation.models.observer import observe, rows_of
 from terrain.estimation.models.skid import Motion, stuck_intervals
 from terrain.estimation.models.slip_model import SlipModel
-from terrain.estimation.models.swerve import default_noise, make_filter, scheduled
+from terrain.estimation.models.swerve import make_filter, scheduled
 from terrain.estimation.wheel_slip import wheel_slip
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.replay import replay
@@ -107,14 +107,12 @@ def batch(run, robot=ROBOT, name="vio15", yaw=None):
         desired = {"speed_x_mps": track.state("speed_mps"), "motion": found.motion}
     else:
         table = measurement_table(run, robot, causal=True, initial_yaw_rad=yaw or 0.0)
-        model, noise = make_filter(name, robot, yaw is not None), default_noise(name, robot, yaw is not None)
-        if yaw is not None:
-            variance = np.tile(noise.measurement_variance, (table.time_s.size, 1))
-            variance[:, [model.rows.index(row) for row in GNSS_ROWS]] = table.gnss_variance
-            noise = Noise(noise.process_variance, variance, noise.initial_variance)
-        noise, inputs = scheduled(model, noise, table)
-        gates = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)
-        track = run_filter(model, noise, table.time_s, table.columns(model.rows), gates, inputs)
+        model, gates = (
+            make_filter(name, robot, yaw is not None),
+            FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S),
+        )
+        samples = scheduled(model, table.z, table.gnss_variance)
+        track = run_filter(model, table.time_s, table.columns(model.rows), gates, *samples)
         table = table.at(track.time_s)
         slip = wheel_slip(track, table, robot)
         desired = {name: track.state(name) for name in ("speed_x_mps", "accel_y_mps2", "yaw_rate_radps")}
@@ -161,7 +159,6 @@ def assert_equal(run, robot=ROBOT, name="vio15", yaw=None, **options):
         ("complex", 30.0, IDEAL, "vio15", None),
         ("complex", 30.0, ROBOT, "vio15", 0.0),
         ("complex", 30.0, ROBOT, "vio12", None),
-        ("complex", 30.0, ROBOT, "slip14", None),
         ("straight", 16.0, ROBOT, "encoder12", 0.1),
     ],
 )

@@ -1,11 +1,14 @@
 """Process noise comes back from what a filter's own equations draw, and what runs do not show has that status."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from model_draws import sample_from_model
 
-from terrain.estimation.consistency import consistency_report, sample_from_model
-from terrain.estimation.filter import Noise, run_filter
-from terrain.estimation.models.swerve import default_noise, make_filter
+from terrain.estimation.consistency import consistency_report
+from terrain.estimation.filter import run_filter
+from terrain.estimation.models.swerve import make_filter
 from terrain.estimation.tuning import GROUPS, TuningStatus, tune_noise
 from terrain.robots import load_robot
 
@@ -22,33 +25,28 @@ def group(name, names):
     return [each.startswith(name) for each in names]
 
 
-def true_noise():
-    plain = default_noise("vio15", ROBOT)
-    walk = plain.process_variance.diagonal().copy()
+def true_model():
+    walk = MODEL.process_variance.diagonal().copy()
     for state, std in STD.items():
         walk[group(state, MODEL.states)] = std**2
-    sample = (
-        plain.measurement_variance.copy()
-    )  # the camera's scatter stands out beside the walk within a tick
+    # the camera's scatter stands out beside the walk within a tick
+    sample = MODEL.measurement_variance.copy()
     sample[group("camera_speed", MODEL.rows)] = 0.0012**2
-    return Noise(walk, sample, np.minimum(plain.initial_variance.diagonal(), 0.1**2))
+    initial = np.minimum(MODEL.initial_variance.diagonal(), 0.1**2)
+    return replace(MODEL, process_variance=walk, measurement_variance=sample, initial_variance=initial)
 
 
 def drawn(n_runs=3, n=500):
-    draws = (
-        sample_from_model(MODEL, true_noise(), n, 0.02, np.random.default_rng(seed)) for seed in range(n_runs)
-    )
+    draws = (sample_from_model(true_model(), n, 0.02, np.random.default_rng(seed)) for seed in range(n_runs))
     return [(time_s, z) for time_s, _, z in draws]
 
 
 def test_variances_that_are_off_by_eight_to_ten_come_back():
-    truth, samples = true_noise(), drawn()
+    truth, samples = true_model(), drawn()
     walk = truth.process_variance.diagonal().copy()
     for name, factor in OFF_BY.items():
         walk[group(name, MODEL.states)] *= factor
-    tuned, report = tune_noise(
-        MODEL, samples, Noise(walk, truth.measurement_variance, truth.initial_variance)
-    )
+    tuned, report = tune_noise(replace(truth, process_variance=walk), samples)
     for name, factor in OFF_BY.items():
         assert report.status[name] is TuningStatus.FOUND
         assert 1 / 1.5 < report.scales[name] * factor < 1.5, name
@@ -56,8 +54,8 @@ def test_variances_that_are_off_by_eight_to_ten_come_back():
         scaled = walk[states] * report.scales[name]
         np.testing.assert_allclose(tuned.process_variance.diagonal()[states], scaled)
     assert report.log_likelihood_after > report.log_likelihood_before + 100
-    track = run_filter(MODEL, tuned, *samples[0])
-    assert [entry.verdict for entry in consistency_report(track).sensors].count("consistent") >= 10
+    track = run_filter(tuned, *samples[0])
+    assert [entry.verdict for entry in consistency_report(track)["sensors"]].count("consistent") >= 10
 
 
 @pytest.mark.parametrize("name", ["steer"])
@@ -65,7 +63,7 @@ def test_a_group_without_measurements_is_reported_as_not_excited(name):
     samples = drawn(n_runs=1, n=200)
     for _, z in samples:
         z[:, [row.startswith((name, "wheel")) for row in MODEL.rows]] = np.nan
-    _, report = tune_noise(MODEL, samples, true_noise())
+    _, report = tune_noise(true_model(), samples)
     assert report.status[name] is TuningStatus.NOT_EXCITED
     assert report.scales[name] == pytest.approx(1.0)
     assert set(report.scales) == {each for each in GROUPS if any(group(each, MODEL.states))}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError
-from terrain.estimation.filter import FilterModel, FilterSettings, Noise, differentiate
+from terrain.estimation.filter import FilterModel, FilterSettings, differentiate
 from terrain.estimation.models.choice import OBSERVERS, make_observer, observers_of
 from terrain.estimation.models.observer import (
     ROWS,
@@ -258,13 +258,14 @@ class CommonSlip(FilterObserver):
             propagate=propagate,
             observe=observe_pose,
             params=np.zeros(0),
-            initial_std=np.array([1e4, 1e4, np.pi, 0.3]),
+            process_variance=np.square([1e-3, 1e-3, 1e-3, 0.01]),
+            measurement_variance=np.square([0.02, 0.02, 0.01]),
+            initial_variance=np.square([1e4, 1e4, np.pi, 0.3]),
             inputs=("left", "right", "yaw_rate"),
             positions=ROWS[4:6],
             angle_rows=("yaw_rad",),
         )
-        noise = Noise(np.square([1e-3, 1e-3, 1e-3, 0.01]), np.square([0.02, 0.02, 0.01]))
-        super().__init__(model, noise, FilterSettings())
+        super().__init__(model, FilterSettings())
 
     def step(self, row, dt_s):
         status = self.advance(dt_s, row[3:], row[:3])

@@ -8,7 +8,7 @@ import pytest
 from terrain.estimation.feed import DERIVED_ROWS, REST_AFTER_S, measurement_table
 from terrain.estimation.filter import GATE_PROBABILITY, HELD_S, REOPEN_AFTER_S, Filter, FilterSettings
 from terrain.estimation.live import LiveFilter
-from terrain.estimation.models.swerve import Schedule, default_noise, make_filter
+from terrain.estimation.models.swerve import make_filter, scheduled
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.replay import replay
 from terrain.logs.schema import IMU_CHANNELS
@@ -31,32 +31,21 @@ def log(terrain="grass"):
 
 @cache
 def parts():
-    model, noise = make_filter("vio15", ROBOT), default_noise("vio15", ROBOT)
-    return model, noise, measurement_table(log(), ROBOT, causal=True)
-
-
-def schedule_of(model, noise):
-    """Return what gives variance, walk and inputs of a tick by its rows."""
-    rows = parts()[2].rows
-
-    def of_row(z):
-        return [part[0] for part in Schedule(model, rows)(np.array(z)[None], noise.measurement_variance)]
-
-    return of_row
+    return make_filter("vio15", ROBOT), measurement_table(log(), ROBOT, causal=True)
 
 
 def gated_until(name, amount, duration_s=4.0):
     """Return uses of a sensor, tick by tick, whose rows are off by an amount from 6 s on."""
-    model, noise, table = parts()
-    sensors = dict(model.sensors)
-    session, schedule_row, uses, times_s = (Filter(model, noise, SETTINGS), schedule_of(model, noise), [], [])
-    off = [model.rows.index(row) for row in sensors[name]]
+    model, table = parts()
+    session, uses, times_s = Filter(model, SETTINGS), [], []
+    off = [model.rows.index(row) for row in dict(model.sensors)[name]]
     z = table.columns(model.rows).copy()
     z[np.ix_(table.time_s > 6.0, off)] += amount
     for n, time_s in enumerate(table.time_s):
         if time_s > 6.0 + duration_s:
             break
-        session.step(float(time_s), z[n], *schedule_row(table.z[n]))
+        now = scheduled(model, table.z[n : n + 1], table.gnss_variance[n : n + 1])
+        session.step(float(time_s), z[n], *(part[0] for part in now))
         uses.append(int(session.use[model.sensor_names.index(name)]))
         times_s.append(time_s)
     return np.array(times_s), np.array(uses)
@@ -67,7 +56,7 @@ def gated_until(name, amount, duration_s=4.0):
     [("gyro", 1.0, HELD_S), ("camera_speed", 1.5, HELD_S), ("wheel_1", 60.0, REOPEN_AFTER_S)],
 )
 def test_held_sensors_are_reopened_after_two_seconds_and_others_after_a_fifth(name, amount, after_s):
-    model, _, _ = parts()
+    model, _ = parts()
     assert (name in model.held) == (after_s == HELD_S)
     time_s, uses = gated_until(name, amount)
     first_s = time_s[np.flatnonzero(uses == GATED)[np.flatnonzero(time_s[uses == GATED] > 6.0)[0]]]
@@ -121,7 +110,7 @@ def test_a_robot_at_rest_keeps_its_position_for_a_minute_without_a_camera():
 
 
 def estimator_rest_places():
-    return [parts()[2].rows.index(row) for row in DERIVED_ROWS[-3:]]
+    return [parts()[1].rows.index(row) for row in DERIVED_ROWS[-3:]]
 
 
 def test_locked_wheels_that_slide_are_no_rest():

@@ -11,7 +11,6 @@ from terrain.estimation.models.skid import (
     MIN_TURN_RADPS,
     Motion,
     make_skid_filter,
-    skid_noise,
     wheel_weight,
     within_bounds,
 )
@@ -19,7 +18,7 @@ from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 
 HUSKY = load_robot("husky")
-MODEL, NOISE = make_skid_filter(HUSKY), skid_noise(HUSKY)
+MODEL = make_skid_filter(HUSKY)
 RATE_HZ = 20.0
 
 
@@ -42,7 +41,7 @@ WINDING = 0.6 * np.sign(np.sin(SECONDS / 3)) * (np.abs(np.sin(SECONDS / 3)) > 0.
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_hidden_track_and_bias_come_back_from_a_drive_with_turns(hidden_m, seed):
     time_s, z = drive(WINDING, hidden_m, seed=seed)
-    track = run_filter(MODEL, NOISE, time_s, z)
+    track = run_filter(MODEL, time_s, z)
     for state, truth, widest in (("effective_track_m", hidden_m, 0.13), ("gyro_bias_radps", 0.004, 0.006)):
         std = track.std(state)[-1]
         assert abs(track.state(state)[-1] - truth) < 3 * std
@@ -86,7 +85,7 @@ def test_jacobians_are_those_of_finite_differences(difference_mps, turns_radps):
 def test_wheels_that_spin_without_turning_the_robot_leave_the_bias_alone(bias_radps, difference_mps):
     time_s, z = drive(np.zeros(SECONDS.size), bias_radps=bias_radps, seed=3, speed_mps=0.0)
     z[:, :2] += np.array([-0.5, 0.5]) * difference_mps
-    track = run_filter(MODEL, NOISE, time_s, z)
+    track = run_filter(MODEL, time_s, z)
     bias, std = track.state("gyro_bias_radps"), track.std("gyro_bias_radps")
     assert (np.abs(bias - bias_radps) < 3 * std).all()
     assert np.abs(bias).max() < 0.003
@@ -99,7 +98,7 @@ def test_track_and_bias_stay_within_their_bounds(sign):
     time_s, z = drive(0.4 * np.ones(SECONDS.size), 0.2, speed_mps=0.0)
     z[:, 2] = 5.0 * sign * z[:, 2] + 0.3
     z[::40, 3] = 0.3 * sign
-    track = run_filter(MODEL, NOISE, time_s, z)
+    track = run_filter(MODEL, time_s, z)
     mean = within_bounds(track.mean, HUSKY.track_m)
     track_m, bias = mean[:, 5], mean[:, 6]
     assert (track_m >= HUSKY.track_m).all()
