@@ -41,7 +41,7 @@ from terrain.estimation.wheel_slip import STEADY_SPEED_MPS, slip_figures, wheel_
 from terrain.kernels import njit
 from terrain.kinematics.camera import body_motion, odometry_stream, to_camera
 from terrain.kinematics.commands import scaled
-from terrain.kinematics.wheels import no_slip_twist, wheel_velocities
+from terrain.kinematics.wheels import no_slip_twist, velocity_matrix
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, RunLog, Windows
 from terrain.robots import Robot, load_robot
@@ -158,7 +158,7 @@ def admissible_twists(trial: Trial) -> Finding:
     # y' - (w/2) g' for both puts wheels 1 and 2 at one end, x' - t g' the third to the left.
     printed = np.array([[-1.0, 0.0], [-1.0, 0.0], [0.0, xi]])
     admitted, corrected = (float(_yaw_rates(place, FORWARD)[1]) for place in (printed, own))
-    wheels = wheel_velocities(own, np.array([FORWARD, 0.0, admitted]))
+    wheels = (velocity_matrix(own) @ [FORWARD, 0.0, admitted]).reshape(-1, 2)
     by_sign = {"yaw rate admitted as printed": admitted, "yaw rate admitted, corrected": corrected}
     numbers = {
         "translation": Numbers(slowest),

@@ -34,7 +34,7 @@ import numpy as np
 from terrain.calibration.finding import Finding, around, undetermined
 from terrain.calibration.sensors import MAX_GAP_S, Stretch, origin_twist
 from terrain.identify import half_width
-from terrain.kinematics.wheels import wheel_velocities
+from terrain.kinematics.wheels import point_velocity
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 from terrain.signals import at_times, true_stretches
@@ -115,7 +115,8 @@ def _within(stretch: Stretch, robot: Robot) -> list[Steady]:
     wheel_speed = motor / robot.equipment.motors.reduction_ratio * robot.wheel_radius_m
     known = np.isfinite(twist).all(axis=1) & np.isfinite(angle).all(axis=1)
     centre = np.full((len(time_s), 3, 2), np.nan)
-    centre[known] = wheel_velocities(robot.wheel_positions_m, twist[known])
+    v_x, v_y, rate = twist[known].T[..., None]
+    centre[known] = np.stack(point_velocity(v_x, v_y, rate, *robot.wheel_positions_m.T), axis=-1)
     sign = np.sign(motor)
     direction = np.arctan2(sign * centre[..., 1], sign * centre[..., 0])
     n = max(round(STEADY_S * wheels.rate_hz), 2)

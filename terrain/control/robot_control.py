@@ -60,7 +60,7 @@ from terrain.control.traction import (
 from terrain.errors import ConfigError
 from terrain.estimation.health import SENSORS, SLIP_SENSORS, SOUND, Health
 from terrain.estimation.live import LiveEstimate
-from terrain.kinematics.commands import FAR_RAD, wheel_command_step
+from terrain.kinematics.commands import wheel_command_step
 from terrain.kinematics.wheels import in_wheel_frame, point_velocity
 from terrain.logs.schema import IMU_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Command, Reading
@@ -403,7 +403,7 @@ class RobotControl:
         target = self._target(belief.terrain, seen, step_s)
         twist, tracked = self._track(desired, seen, time_s, dt_s)
         admitted, wheel_radps, self.steer_rad = wheel_command_step(
-            self._positions_m, *self._limits, step_s, FAR_RAD, twist, self.steer_rad
+            self._positions_m, *self._limits, step_s, twist, self.steer_rad
         )
         desired_mps = max(map(abs, wheel_radps.tolist())) * self._radius_m
         if not holds:

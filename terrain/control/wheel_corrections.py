@@ -54,7 +54,7 @@ class LowLevelKinematics:
 
     def step(self, twist: Array, dt_s: float) -> Array:
         """Return the rates (3,) for a twist, and move the steering to within a step."""
-        limits = (*self._limits, dt_s, FAR_RAD)
+        limits = (*self._limits, dt_s)
         wheel_radps: Array
         _, wheel_radps, self.steer_rad = wheel_command_step(self._positions_m, *limits, twist, self.steer_rad)
         return wheel_radps

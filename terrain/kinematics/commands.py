@@ -21,7 +21,7 @@ import numpy as np
 from numba import types
 
 from terrain.kernels import njit
-from terrain.kinematics.wheels import point_velocity, wheel_frame_velocities, wheel_velocities
+from terrain.kinematics.wheels import point_velocity, velocity_matrix, wheel_frame_velocities
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot
 
@@ -85,9 +85,8 @@ def wheel_motion(robot: Robot, twist: Array, dt_s: float) -> WheelMotion:
     if robot.steered:
         _, motors, steering, _, _ = robot.equipment
         limits = (motors.speed_max_radps, steering.rate_max_radps, dt_s)
-        start = np.zeros(len(robot.wheels))
         admitted, wheel_radps, steers = wheel_commands(
-            robot.wheel_positions_m, radius_m, *limits, twist, start
+            robot.wheel_positions_m, radius_m, *limits, np.asarray(twist, float), np.zeros(len(robot.wheels))
         )
         return WheelMotion(admitted, wheel_radps * radius_m, wheel_radps, steers)
     speeds, _ = wheel_frame_velocities(twist, robot.wheel_positions_m, robot.wheel_directions_rad)
@@ -99,96 +98,31 @@ def wheel_motion(robot: Robot, twist: Array, dt_s: float) -> WheelMotion:
     return WheelMotion(twist, speeds, speeds / radius_m, np.zeros_like(speeds))
 
 
-def inverse(positions_m: Array, radius_m: float, twist: Array, steer_now_rad: Array) -> tuple[Array, Array]:
-    """Return wheel speeds and steering angles (..., wheels) for a twist (..., 3), equation (2.5).
-
-    Of the two solutions of a wheel, half a turn apart, it is the one that moves the steering least.  Angles
-    are not wrapped: slip rings let the steering turn for ever, and the result lies within a quarter turn of
-    ``steer_now_rad`` (..., wheels).  A wheel that stands still keeps its steering.
-
-    Examples
-    --------
-    >>> inverse([[-0.5, 0.0], [0.5, 0.0]], 0.2, [-1.0, 0.0, 0.0], [0.0, 7.0])
-    (array([-5., -5.]), array([0.        , 6.28318531]))
-    """
-    along, across = np.moveaxis(wheel_velocities(positions_m, twist), -1, 0)
-    speed, heading = np.hypot(along, across), np.arctan2(across, along)
-    k = np.rint((heading - steer_now_rad) / np.pi)
-    standing, sign = speed < STANDING_MPS, np.where(k % 2 == 0, 1.0, -1.0)
-    wheel_radps = np.where(standing, 0.0, sign * speed / radius_m)
-    return wheel_radps, np.where(standing, steer_now_rad, heading - k * np.pi)
-
-
-def wheel_commands(
-    positions_m: Array,
-    radius_m: float,
-    speed_max_radps: float,
-    rate_max_radps: float,
-    dt_s: float,
-    twists: Array,
-    steer_0: Array,
-    far_rad: float = FAR_RAD,
-) -> tuple[Array, Array, Array]:
-    """Return the commands of the wheels, step by step, to drive a sequence of twists.
-
-    Parameters
-    ----------
-    positions_m, radius_m : (wheels, 2) and radius of the wheels
-    speed_max_radps, rate_max_radps : limits of the wheels, to which twists are shortened, and of the steering's rate
-    dt_s : time from one twist to the next
-    twists, steer_0 : (n, 3), and (wheels,) the steering before the first
-    far_rad : see :func:`wheel_command_step`
-
-    Returns
-    -------
-    twist_admitted : (n, 3) the twists within the admissible region
-    wheel_radps, steer_rad : (n, wheels)
-
-    Examples
-    --------
-    >>> wheels_m = [[-0.5, 0.0], [0.5, 0.0]]
-    >>> _, wheel, steer = wheel_commands(wheels_m, 0.2, 10.0, 2.0, 0.1, [[0.0, 0.4, 0.0]] * 9, [0.0, 0.0])
-    >>> steer[:, 0].round(2)
-    array([0.2 , 0.4 , 0.6 , 0.8 , 1.  , 1.2 , 1.4 , 1.57, 1.57])
-    >>> wheel[:, 0].round(2)
-    array([0.4 , 0.78, 1.13, 1.43, 1.68, 1.86, 2.  , 2.  , 2.  ])
-    """
-    arrays = (np.asarray(given, dtype=np.float64) for given in (positions_m, twists, steer_0))
-    positions, desired, steer = arrays
-    limits = (radius_m, speed_max_radps, rate_max_radps, dt_s, far_rad)
-    return _commands(positions, *map(float, limits), desired, steer)  # type: ignore[no-any-return]
-
-
-@njit(types.UniTuple(_F8, 2)(_F8, _F8, _F8, _F8))
-def _aim(along_mps: float, across_mps: float, radius_m: float, now_rad: float) -> tuple[float, float]:
-    """Return speed and steering of one wheel, (2.5) with the k that moves the steering least."""
-    speed_mps = math.hypot(along_mps, across_mps)
-    if speed_mps < STANDING_MPS:
-        return 0.0, now_rad
-    heading_rad = math.atan2(across_mps, along_mps)
-    k = np.rint((heading_rad - now_rad) / math.pi)
-    sign = 1.0 if k % 2 == 0 else -1.0
-    return sign * speed_mps / radius_m, heading_rad - k * math.pi
-
-
-@njit(types.UniTuple(_F8[::1], 3)(_TABLE, _F8, _F8, _F8, _F8, _F8, _ROW, _ROW))
+@njit(types.UniTuple(_F8[::1], 3)(_TABLE, _F8, _F8, _F8, _F8, _ROW, _ROW))
 def wheel_command_step(
     positions_m: Array,
     radius_m: float,
     speed_max_radps: float,
     rate_max_radps: float,
     dt_s: float,
-    far_rad: float,
     twist: Array,
     steer_rad: Array,
 ) -> tuple[Array, Array, Array]:
     """Return the commands of the wheels for one twist; compiled, callable from compiled code, checks nothing.
 
-    The twist is shortened to the admissible region, each wheel aims (:func:`inverse`) from its last
-    steering command, and the steering moves there no faster than it can. While it moves, the wheels'
-    rolling directions contradict each other: as long as one wheel is further than ``far_rad`` from its aim,
-    the speeds of all are multiplied by ``max(0, cos(error))`` of the worst one, so that none scrubs. The
-    thesis gives no such law; it says only that steering takes time.
+    The twist is shortened to the admissible region, (2.10): its direction is kept, so the centre of rotation and the
+    path are.  Each wheel aims by (2.5) with the k that moves the steering least: angles are not wrapped, as slip rings
+    let the steering turn for ever, and a wheel that stands still keeps its steering.  The steering moves there no
+    faster than it can. While it moves, the wheels' rolling directions contradict each other: as long as one wheel is
+    further than :data:`FAR_RAD` from its aim, the speeds of all are multiplied by ``max(0, cos(error))`` of the worst
+    one, so that none scrubs. The thesis gives no such law; it says only that steering takes time.
+
+    Parameters
+    ----------
+    positions_m, radius_m : (wheels, 2) and radius of the wheels
+    speed_max_radps, rate_max_radps : limits of the wheels, to which twists are shortened, and of the steering's rate
+    dt_s : time from one twist to the next
+    twist, steer_rad : (3,) desired, and (wheels,) the steering commanded before
 
     Returns
     -------
@@ -209,48 +143,64 @@ def wheel_command_step(
     reach = rate_max_radps * dt_s
     worst = 0.0
     for i in range(wheels):
-        speed[i], aim = _aim(scale * along[i], scale * across[i], radius_m, steer_rad[i])
+        ahead, left, aim = scale * along[i], scale * across[i], steer_rad[i]
+        speed_mps = math.hypot(ahead, left)
+        speed[i] = 0.0
+        if speed_mps >= STANDING_MPS:
+            heading = math.atan2(left, ahead)
+            k = np.rint((heading - steer_rad[i]) / math.pi)
+            speed[i], aim = (1.0 if k % 2 == 0 else -1.0) * speed_mps / radius_m, heading - k * math.pi
         move = aim - steer_rad[i]
         steer[i] = aim if abs(move) <= reach else steer_rad[i] + math.copysign(reach, move)
         worst = max(worst, abs(aim - steer[i]))
-    if worst > far_rad:
+    if worst > FAR_RAD:
         for i in range(wheels):
             speed[i] *= max(0.0, math.cos(worst))
     return admitted, speed, steer
 
 
-@njit(types.UniTuple(_F8[:, ::1], 3)(_TABLE, _F8, _F8, _F8, _F8, _F8, _TABLE, _ROW))
-def _commands(
+@njit(types.UniTuple(_F8[:, ::1], 3)(_TABLE, _F8, _F8, _F8, _F8, _TABLE, _ROW))
+def wheel_commands(
     positions_m: Array,
     radius_m: float,
     speed_max_radps: float,
     rate_max_radps: float,
     dt_s: float,
-    far_rad: float,
     twists: Array,
     steer_0: Array,
 ) -> tuple[Array, Array, Array]:
+    """Return the commands of the wheels, (n, ...) of :func:`wheel_command_step`, to drive twists (n, 3).
+
+    Examples
+    --------
+    >>> wheels_m, twists = np.array([[-0.5, 0.0], [0.5, 0.0]]), np.tile([0.0, 0.4, 0.0], (9, 1))
+    >>> _, wheel, steer = wheel_commands(wheels_m, 0.2, 10.0, 2.0, 0.1, twists, np.zeros(2))
+    >>> steer[:, 0].round(2)
+    array([0.2 , 0.4 , 0.6 , 0.8 , 1.  , 1.2 , 1.4 , 1.57, 1.57])
+    >>> wheel[:, 0].round(2)
+    array([0.4 , 0.78, 1.13, 1.43, 1.68, 1.86, 2.  , 2.  , 2.  ])
+    """
     n, wheels = len(twists), len(positions_m)
     admitted, speed, steer = np.empty((n, 3)), np.empty((n, wheels)), np.empty((n, wheels))
     last = steer_0.copy()
     for k in range(n):
         admitted[k], speed[k], last = wheel_command_step(
-            positions_m, radius_m, speed_max_radps, rate_max_radps, dt_s, far_rad, twists[k], last
+            positions_m, radius_m, speed_max_radps, rate_max_radps, dt_s, twists[k], last
         )
         steer[k] = last
     return admitted, speed, steer
 
 
 def scaled(positions_m: Array, radius_m: float, twist: Array, speed_max_radps: float) -> Array:
-    """Return the twist (..., 3) in its own direction, shortened until no wheel saturates, (2.10).
-
-    The direction is kept, so the centre of rotation and the path are: the robot is slower on the same curve.
+    """Return twists (..., 3) in their own direction, shortened until no wheel saturates, (2.10).
 
     Examples
     --------
-    >>> scaled([[-0.5, 0.0], [0.5, 0.0]], 0.2, [2.4, 0.0, 3.6], 10.0)
+    >>> scaled(np.array([[-0.5, 0.0], [0.5, 0.0]]), 0.2, np.array([2.4, 0.0, 3.6]), 10.0)
     array([1.6, 0. , 2.4])
     """
-    fastest_mps = np.linalg.norm(wheel_velocities(positions_m, twist), axis=-1).max(axis=-1)
+    desired = np.asarray(twist, dtype=np.float64)
+    velocities = (desired @ velocity_matrix(positions_m).T).reshape(*desired.shape[:-1], -1, 2)
     limit_mps = radius_m * speed_max_radps
-    return np.asarray(twist * (limit_mps / np.maximum(fastest_mps, limit_mps))[..., None])
+    fastest_mps = np.maximum(np.linalg.norm(velocities, axis=-1).max(axis=-1), limit_mps)
+    return np.asarray(desired * (limit_mps / fastest_mps)[..., None])

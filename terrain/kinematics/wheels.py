@@ -106,21 +106,6 @@ def velocity_matrix(positions_m: Array) -> Array:
     return np.stack([np.stack([one, none, -y_m], -1), np.stack([none, one, x_m], -1)], 1).reshape(-1, 3)
 
 
-def wheel_velocities(positions_m: Array, twist: Array) -> Array:
-    """Return the velocity (..., wheels, 2) of the wheel centres in the body frame, equation (2.2).
-
-    Examples
-    --------
-    >>> wheel_velocities([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.75]], [1.0, 0.0, 0.2])
-    array([[ 1.  , -0.1 ],
-           [ 1.  ,  0.1 ],
-           [ 1.15,  0.  ]])
-    """
-    rows = velocity_matrix(finite_numbers("positions_m", positions_m, 2))
-    flat = finite_numbers("twist", twist, 3) @ rows.T
-    return np.asarray(flat.reshape(*flat.shape[:-1], -1, 2))
-
-
 def rolling_matrix(positions_m: Array, direction_rad: Array) -> Array:
     """Return J (..., wheels, 3): circumferential speeds of wheels that roll without slip are J times the twist.
 

@@ -15,7 +15,7 @@ from terrain.control.traction import (
     settings_of,
     traction_step,
 )
-from terrain.kinematics.commands import inverse
+from terrain.kinematics.commands import wheel_command_step
 from terrain.kinematics.wheels import no_slip_twist
 from terrain.robots import load_robot
 
@@ -202,7 +202,9 @@ numbers = st.floats(-2.0, 2.0)
 def test_speed_never_falls_while_more_is_desired_and_the_turning_centre_stays(
     twist, was, direction, accel, slip, torque
 ):
-    wheel, steer = inverse(POSITIONS_M, RADIUS_M, np.array(twist), np.zeros(3))
+    wheel, steer = wheel_command_step(
+        np.array(POSITIONS_M), RADIUS_M, 1e9, 1e9, 1.0, np.array(twist, float), np.zeros(3)
+    )[1:]
     state = TractionState(driven_mps=was, desired_mps=was)
     inputs = {
         "ground_mps": direction * np.sign(wheel),

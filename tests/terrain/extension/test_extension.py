@@ -10,7 +10,7 @@ import pytest
 import terrain
 from terrain.effects import Stage, in_plant, on_samples, parameters_of
 from terrain.errors import ConfigError
-from terrain.estimation.estimate import enriched, estimate_run, model_and_noise, summarize
+from terrain.estimation.estimate import enriched, estimate_run, model_of, summarize
 from terrain.estimation.live import LiveFilter
 from terrain.extension import (
     Correction,
@@ -263,7 +263,7 @@ def test_corrections_are_applied_at_the_edge_and_filters_refuse_what_is_not_corr
             found.add(path.relative_to(root).as_posix())
     assert found == EDGES
     robot, run = extended(camera_yaw_rad=0.1), run_of("straight", 5.0)
-    for refused in (lambda: model_and_noise(run, robot, "vio15"), lambda: LiveFilter(robot)):
+    for refused in (lambda: model_of(run, robot, "vio15"), lambda: LiveFilter(robot)):
         with pytest.raises(ConfigError, match="camera_yaw_rad is not corrected"):
             refused()
     check_corrected(extended(force_slip_ratio=0.1))  # which filters do not model

@@ -6,7 +6,7 @@ import pytest
 from scipy.stats import chi2
 
 from terrain.errors import ConfigError
-from terrain.kinematics.wheels import wheel_velocities
+from terrain.kinematics.wheels import velocity_matrix
 from terrain.robots import load_robot
 from terrain.simulation.scenario import (
     ACCEL_MPS2,
@@ -56,7 +56,10 @@ def test_every_scenario_is_feasible_and_rests_where_stated(name, speed_mps):
             change[change[:, 0].argmax()] = 0.0
         assert np.hypot(change[:, 0], change[:, 1]).max() <= ACCEL_MPS2 * (1 + 1e-9)
         assert change[:, 2].max() <= YAW_ACCEL_RADPS2 * (1 + 1e-9)
-        wheel_speed_mps = np.linalg.norm(wheel_velocities(ROBOT.wheel_positions_m, drive.twist), axis=-1)
+        wheel_speed_mps = np.linalg.norm(
+            (drive.twist @ velocity_matrix(ROBOT.wheel_positions_m).T).reshape(len(drive.twist), -1, 2),
+            axis=-1,
+        )
         assert wheel_speed_mps.max() <= ROBOT.wheel_radius_m * ROBOT.motors.speed_max_radps * (1 + 1e-9)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, SPEED_X, SPEED_Y, TURNING_CURRENT, vector_of
-from terrain.kinematics.commands import inverse
+from terrain.kinematics.commands import wheel_command_step
 from terrain.robots import load_robot
 from terrain.simulation.plants.dynamic import DEFLECTION_DAMPING_S, shear_slip
 from terrain.simulation.plants.planar import (
@@ -38,6 +38,16 @@ TWISTS = {
     "arc": (0.6, 0.0, 0.3),
     "spot": (0.0, 0.0, 0.5),
 }
+
+
+def aimed(robot, twist, radius_m=None):
+    """Return the rates and steering angles for a twist, without limits."""
+    limits = (1e9, 1e9, 1.0)
+    radius_m = radius_m or robot.wheel_radius_m
+    _, wheel, steer = wheel_command_step(
+        robot.wheel_positions_m, radius_m, *limits, np.array(twist, float), np.zeros(3)
+    )
+    return wheel, steer
 
 
 def still(robot):
@@ -80,7 +90,7 @@ def replayed(robot, values, wheel_speed, steer=None, grade=None, roll=None, grou
 @pytest.mark.parametrize("twist", TWISTS.values(), ids=TWISTS)
 def test_the_wheels_of_a_twist_move_the_robot_by_that_twist(twist):
     robot = still(AGRIMARO)
-    wheel, steer = inverse(robot.wheel_positions_m, robot.wheel_radius_m, np.array(twist), np.zeros(3))
+    wheel, steer = aimed(robot, twist)
     shown = replayed(robot, {}, at_rate(wheel * robot.wheel_radius_m), at_rate(steer))
     for channel, value in zip((SPEED_X, SPEED_Y, GYRO), twist, strict=True):
         np.testing.assert_allclose(shown[channel], value, atol=1e-7)  # no contact is quite rigid
@@ -157,7 +167,7 @@ def test_three_wheels_that_slip_each_by_itself_move_as_one_twist_that_slips():
     t = dt * np.arange(n)
     ramp = np.clip(t, 0.0, 1.0)
     twist = np.column_stack([0.6 * ramp, 0.2 * ramp * np.sin(0.8 * t), 0.3 * ramp * np.sin(1.1 * t)])
-    rolled = [inverse(robot.wheel_positions_m, 1.0, desired, np.zeros(3)) for desired in twist]
+    rolled = [aimed(robot, desired, 1.0) for desired in twist]
     wheel_speed, steer = (np.array(part) for part in zip(*rolled, strict=True))
     wheel_speed, steer = np.ascontiguousarray(wheel_speed), np.unwrap(steer, axis=0)
     each = a_contact_for_each_wheel(robot, ground, wheel_speed, steer, dt)
@@ -252,9 +262,7 @@ def test_a_turning_robot_slips_to_the_outside_of_the_turn_and_slows_down():
 
 def test_steering_effects_match_their_formulas():
     robot = still(AGRIMARO)
-    wheel, steer = inverse(
-        robot.wheel_positions_m, robot.wheel_radius_m, np.array([0.6, 0.0, 0.2]), np.zeros(3)
-    )
+    wheel, steer = aimed(robot, [0.6, 0.0, 0.2])
     right, wheel_speed = (
         replayed(robot, {}, at_rate(wheel * robot.wheel_radius_m), at_rate(steer)),
         at_rate(wheel * 0.2),
