@@ -461,12 +461,18 @@ def rows_of(
     instruments = wheel_speed
     if math.isfinite(low_pass.instrument_cutoff_hz):
         instruments = _decimated(wheel_speed, _window(low_pass.instrument_cutoff_hz, 1.0 / dt), 1)
-    true_wheel_speed, true_grade, true_roll = corrected_inputs(planar, vector, dt, instruments, grade, roll)
+    true_wheel_speed, true_grade, true_roll = corrected_inputs(
+        planar.body, vector, dt, instruments, grade, roll
+    )
     truth = move(planar, vector, dt, true_wheel_speed, steer, true_grade, true_roll)
 
     def predicted(point: Array, speeds: Array, only_sensed: bool) -> Array:
         """Return the low-pass filtered prediction (rows, channels); the motion stays where only sensors change."""
-        seen = sense(planar, point, dt, truth) if only_sensed else replay(planar, point, dt, speeds, *inputs)
+        seen = (
+            sense(planar.body, point, dt, truth)
+            if only_sensed
+            else replay(planar, point, dt, speeds, *inputs)
+        )
         return np.asarray(decimate(seen, holes, *window))[kept]
 
     inputs = steer, grade, roll

@@ -910,7 +910,33 @@ def _move_swerve(params: Array, vector: Array, dt: float, inputs: Inputs) -> Arr
     wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance = inputs
     contact, p, n = params[0], vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
     body, out = contact.body, np.zeros(n, TRUTH)
-    u, pace, mean_wheel_speed, heading = _no_slip(contact, p, dt, wheel_speed_mps, steer_rad)
+    # the twist without slip (3, n), the wheel speeds' root mean square and mean (n,), and what a traction in each
+    # direction of the twist pulls along the wheels (3, n)
+    scale = 1.0 + p.wheel_radius_ratio
+    right, left = 1.0 + 0.5 * p.one_sided_radius_ratio, 1.0 - 0.5 * p.one_sided_radius_ratio
+    u, heading, angle = np.zeros((3, n)), np.zeros((3, n)), np.empty((3, n))
+    pace, mean_wheel_speed = np.empty(n), np.empty(n)
+    offsets = (p.steering_offset_1_rad, p.steering_offset_2_rad, p.steering_offset_3_rad)
+    scales = (p.wheel_scale_1_ratio, p.wheel_scale_2_ratio, p.wheel_scale_3_ratio)
+    for i in range(3):
+        angle[i] = steered(steer_rad[:, i] + offsets[i], p.steering_delay_s, p.steering_backlash_rad, dt)
+    for k in range(n):
+        square, total = 0.0, 0.0
+        for i in range(3):
+            wheel_speed = wheel_speed_mps[k, i] * scale * (right if i == 2 else left) * (1.0 + scales[i])
+            square += wheel_speed * wheel_speed
+            total += wheel_speed
+            cos, sin = math.cos(angle[i, k]), math.sin(angle[i, k])
+            for j in range(3):
+                gain = contact.to_twist[j, 2 * i] * cos + contact.to_twist[j, 2 * i + 1] * sin
+                u[j, k] += wheel_speed * gain
+            heading[0, k] += cos / 3.0
+            heading[1, k] += sin / 3.0
+            heading[2, k] += (contact.arm_ratio[i, 0] * sin - contact.arm_ratio[i, 1] * cos) / 3.0
+        u[0, k] -= u[2, k] * body.com_y_m
+        u[1, k] += u[2, k] * body.com_x_m
+        u[2, k] *= contact.spread_m
+        pace[k], mean_wheel_speed[k] = math.sqrt(square / 3.0), total / 3.0
     weight = body.mass_kg * GRAVITY_MPS2
     load = 1.0 + p.payload_ratio
     pressed = load / (1.0 + body.load_ratio * p.payload_ratio)
@@ -994,43 +1020,6 @@ def _move_swerve(params: Array, vector: Array, dt: float, inputs: Inputs) -> Arr
         direction = speed / math.sqrt(speed * speed + ROLLING_MPS * ROLLING_MPS)
         out[k].current_a = (torque + body.friction_nm * direction) / body.nm_per_a
     return out
-
-
-@inner
-def _no_slip(
-    contact: Any, p: Any, dt: float, wheel_speed_mps: Array, steer_rad: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Return the twist without slip, the wheel speeds' root mean square and mean, and the pull of tractions.
-
-    (3, n), (n,), (n,), and (3, n): what a traction in each direction of the twist pulls along the wheels.
-    """
-    n = wheel_speed_mps.shape[0]
-    scale = 1.0 + p.wheel_radius_ratio
-    right, left = 1.0 + 0.5 * p.one_sided_radius_ratio, 1.0 - 0.5 * p.one_sided_radius_ratio
-    u, heading, angle = np.zeros((3, n)), np.zeros((3, n)), np.empty((3, n))
-    pace, mean_wheel_speed = np.empty(n), np.empty(n)
-    offsets = (p.steering_offset_1_rad, p.steering_offset_2_rad, p.steering_offset_3_rad)
-    scales = (p.wheel_scale_1_ratio, p.wheel_scale_2_ratio, p.wheel_scale_3_ratio)
-    for i in range(3):
-        angle[i] = steered(steer_rad[:, i] + offsets[i], p.steering_delay_s, p.steering_backlash_rad, dt)
-    for k in range(n):
-        square, total = 0.0, 0.0
-        for i in range(3):
-            wheel_speed = wheel_speed_mps[k, i] * scale * (right if i == 2 else left) * (1.0 + scales[i])
-            square += wheel_speed * wheel_speed
-            total += wheel_speed
-            cos, sin = math.cos(angle[i, k]), math.sin(angle[i, k])
-            for j in range(3):
-                gain = contact.to_twist[j, 2 * i] * cos + contact.to_twist[j, 2 * i + 1] * sin
-                u[j, k] += wheel_speed * gain
-            heading[0, k] += cos / 3.0
-            heading[1, k] += sin / 3.0
-            heading[2, k] += (contact.arm_ratio[i, 0] * sin - contact.arm_ratio[i, 1] * cos) / 3.0
-        u[0, k] -= u[2, k] * contact.body.com_y_m
-        u[1, k] += u[2, k] * contact.body.com_x_m
-        u[2, k] *= contact.spread_m
-        pace[k], mean_wheel_speed[k] = math.sqrt(square / 3.0), total / 3.0
-    return u, pace, mean_wheel_speed, heading
 
 
 SWERVE = PlanarDrive(CONTACT, _swerve_numbers, _move_swerve)
@@ -1133,24 +1122,16 @@ def replay(
     wheel_speed_mps, steer_rad, grade_rad, roll_rad : (n, wheels), (n, wheels), (n,), (n,) as measured: the lag of the
         encoders, the clock and the offsets of the tilt are corrected here
     """
-    wheel_speed, grade, roll = corrected_inputs(planar, vector, dt, wheel_speed_mps, grade_rad, roll_rad)
-    return sense(planar, vector, dt, move(planar, vector, dt, wheel_speed, steer_rad, grade, roll))
-
-
-def corrected_inputs(
-    planar: Planar, vector: Array, dt: float, wheel_speed_mps: Array, grade_rad: Array, roll_rad: Array
-) -> tuple[Array, Array, Array]:
-    """Return true wheel speeds, grade and roll from the measured ones; see :func:`replay`."""
-    corrected: tuple[Array, Array, Array] = _corrected(
-        planar.body, vector, dt, wheel_speed_mps, grade_rad, roll_rad
-    )
-    return corrected
+    inputs = corrected_inputs(planar.body, vector, dt, wheel_speed_mps, grade_rad, roll_rad)
+    truth = move(planar, vector, dt, inputs[0], steer_rad, *inputs[1:])
+    return np.asarray(sense(planar.body, vector, dt, truth))
 
 
 @njit
-def _corrected(
+def corrected_inputs(
     params: Array, vector: Array, dt: float, wheel_speed_mps: Array, grade_rad: Array, roll_rad: Array
 ) -> tuple[Array, Array, Array]:
+    """Return true wheel speeds, grade and roll from the measured ones; ``params`` is :attr:`Planar.body`."""
     body, p = params[0], vector.view(EFFECTS)[0]
     wheel_speed, grade, roll = wheel_speed_mps, grade_rad - p.pitch_offset_rad, roll_rad - p.roll_offset_rad
     lag = body.encoder_lag_s + p.encoder_lag_s
@@ -1165,19 +1146,16 @@ def _corrected(
     return wheel_speed, grade, roll
 
 
-def sense(planar: Planar, vector: Array, dt: float, truth: Array) -> Array:
+@njit
+def sense(params: Array, vector: Array, dt: float, truth: Array) -> Array:
     """Return the channels (n, len(CHANNELS)) that sensors without noise measure.
 
     Parameters
     ----------
-    planar, vector, dt : as :func:`move` takes them
+    params : :attr:`Planar.body`
+    vector, dt : as :func:`move` takes them
     truth : (n,) that it returns
     """
-    return np.asarray(_sense(planar.body, vector, dt, truth))
-
-
-@njit
-def _sense(params: Array, vector: Array, dt: float, truth: Array) -> Array:
     body, p, n = params[0], vector.view(EFFECTS)[0], truth.shape[0]
     out = np.empty((n, 7))
     lever_x, lever_y = body.lever_x_m + p.lever_x_m, body.lever_y_m + p.lever_y_m
@@ -1352,15 +1330,22 @@ def run_planar(
         robot.steering_rate_max_radps,
     )
     n = len(speed)
-    active, disturbance, turned = np.zeros(n), np.zeros((0, 3)), speed
-    if noise is not None:
-        active = activity(np.abs(speed).mean(axis=1), noise)
-        std, tau_s = (
-            [noise[f"{part}_{unit}"] for part, unit in zip(("along", "across", "yaw"), units, strict=True)]
-            for units in (("ratio", "ratio", "radps"), "sss")
-        )
-        disturbance = coloured(rngs["ground"].standard_normal((3, n)), std, tau_s, dt)
-        disturbance[:, 2] *= active
+    loud, levels, turned = float(noise is not None), noise or spread_numbers("noise"), speed
+
+    def white(purpose: str, *shape: int) -> Array:
+        """Draw white noise of size 1; 0 without noise."""
+        return np.asarray(loud * rngs[purpose].standard_normal(shape))
+
+    def shaken(purpose: str, names: str, units: str, rate_hz: float) -> Array:
+        """Draw coloured noise (k, c) of sizes and memories by their names in a row."""
+        sizes = [levels[f"{name}_{unit}"] for name, unit in zip(names.split(), units.split(), strict=True)]
+        tau_s = [levels[f"{name}_s"] for name in names.split()]
+        k = -(-n // round(1.0 / (rate_hz * dt)))
+        return coloured(white(purpose, len(sizes), k), sizes, tau_s, 1.0 / rate_hz)
+
+    active = activity(np.abs(speed).mean(axis=1), levels)
+    disturbance = shaken("ground", "along across yaw", "ratio ratio radps", 1.0 / dt)
+    disturbance[:, 2] *= active
     if eccentric := outside.get("wheel_eccentricity_ratio", 0.0):
         phase = rngs["outside"].uniform(0.0, 2.0 * math.pi, wheels)
         angle = np.cumsum(speed, axis=0) * dt / robot.wheel_radius_m
@@ -1377,7 +1362,7 @@ def run_planar(
     scales = [f"wheel_scale_{wheel}_ratio" for wheel in robot.wheels]
     counts = np.array([1.0 + p[name] if name in INDEX else 1.0 for name in scales])  # encoders may lose some
     true_speed = turned * (1.0 + p["wheel_radius_ratio"]) * sides * counts
-    ideal = dict(zip(CHANNELS, sense(planar, vector, dt, truth).T, strict=True))
+    ideal = dict(zip(CHANNELS, sense(planar.body, vector, dt, truth).T, strict=True))
     v_x, v_y, turn = (truth[name] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"))
 
     def samples(rate_hz: float) -> tuple[Array, Array]:
@@ -1392,7 +1377,7 @@ def run_planar(
 
     # wheels: encoders count distance over a period, stamped in its middle; currents
     rows, time_s = samples(WHEELS_HZ)
-    k, every, rng, wheels_s = len(rows), round(1.0 / (WHEELS_HZ * dt)), rngs["wheels"], time_s
+    k, every, wheels_s, moving = len(rows), round(1.0 / (WHEELS_HZ * dt)), time_s, active[rows]
     total, turning = ideal[CURRENT][rows], ideal[TURNING_CURRENT][rows]
     if spike_a := outside.get("stick_slip_a", 0.0):
         mean = speed.mean(axis=1)
@@ -1412,28 +1397,27 @@ def run_planar(
     inside = np.clip(at, 0, n - 1)
     distance = np.vstack([np.zeros(wheels), np.cumsum(0.5 * dt * (speed[:-1] + speed[1:]), axis=0)])
     counted = distance[inside] + ((at - inside) * dt)[:, None] * speed[inside]
-    white = np.zeros((k, wheels))
-    if noise is not None:
-        moving = active[rows]
-        jitter = rng.standard_normal((k + 1, wheels)) * noise["encoder_m"]
-        counted = counted + jitter * np.append(moving, moving[-1])[:, None]
-        if sensors.hall_steps_ratio > 0.0:
-            turns = sensors.hall_steps_ratio * motors.reduction_ratio
-            step_m = 2.0 * math.pi * robot.wheel_radius_m / turns
-            counted = np.floor(counted / step_m) * step_m
-        white_mps = sensors.motor_std_radps / motors.reduction_ratio * robot.wheel_radius_m
-        white = white_mps * rng.standard_normal((k, wheels))
-        std_a, forget_s = current_noise_a(noise, robot) / math.sqrt(wheels), noise["current_s"]
-        drawn = rng.standard_normal((wheels, k))
-        drawn = coloured(drawn, [std_a] * wheels, [forget_s] * wheels, dt * every) * moving[:, None]
-        currents = currents + drawn + sensors.current_std_a * rng.standard_normal((k, wheels))
+    jitter = white("wheels", k + 1, wheels) * levels["encoder_m"]
+    counted = counted + jitter * np.append(moving, moving[-1])[:, None]
+    if loud and sensors.hall_steps_ratio > 0.0:
+        turns = sensors.hall_steps_ratio * motors.reduction_ratio
+        step_m = 2.0 * math.pi * robot.wheel_radius_m / turns
+        counted = np.floor(counted / step_m) * step_m
+    white_mps = sensors.motor_std_radps / motors.reduction_ratio * robot.wheel_radius_m
+    rate_noise = white_mps * white("wheels", k, wheels)
+    std_a, forget_s = (
+        [current_noise_a(levels, robot) / math.sqrt(wheels)] * wheels,
+        [levels["current_s"]] * wheels,
+    )
+    drawn = coloured(white("wheels", wheels, k), std_a, forget_s, dt * every) * moving[:, None]
+    currents = currents + drawn + sensors.current_std_a * white("wheels", k, wheels)
     measured, lag_s = (
         np.diff(counted, axis=0) / (every * dt),
         sensors.encoder_time_constant_s + p["encoder_lag_s"],
     )
     measured = np.column_stack([lagged(column.copy(), lag_s, every * dt) for column in measured.T])
     measured[np.abs(measured) <= STANDSTILL_MPS] = 0.0
-    values = robot.logged_rates(sensing.add_rate_noise(measured, white, STANDSTILL_MPS))
+    values = robot.logged_rates(sensing.add_rate_noise(measured, rate_noise, STANDSTILL_MPS))
     channels = robot.rate_channels
     if logs_currents:
         currents = np.abs(currents) if robot.on_omni_wheels else currents  # as its logs have them
@@ -1448,18 +1432,12 @@ def run_planar(
         lever_m = complex(camera.lever_x_m + p["lever_x_m"], camera.lever_y_m + p["lever_y_m"])
         marker = (x_m + 1j * y_m + np.exp(1j * yaw_rad) * lever_m) * (1.0 + p["camera_scale_ratio"])
         seen = np.column_stack([marker.real, marker.imag, yaw_rad - p["camera_yaw_rad"]])
-        if noise is not None:
-            std_pose = np.array([camera.position_std_m, camera.position_std_m, camera.yaw_std_rad])
-            seen = seen + std_pose * rngs["camera"].standard_normal(seen.shape)
+        std = np.array([camera.position_std_m, camera.position_std_m, camera.yaw_std_rad])
+        seen = seen + std * white("camera", *seen.shape)
         streams["pose"] = Stream(time_s, seen, POSE_CHANNELS)
     else:
         rows, time_s = samples(IMU_HZ)
-        k, rng, imu_s, level = (
-            len(rows),
-            rngs["imu"],
-            sensors.imu_latency_s + p["imu_latency_s"],
-            np.cos(grade),
-        )
+        k, imu_s, level = len(rows), sensors.imu_latency_s + p["imu_latency_s"], np.cos(grade)
         true, (scale, bias), drawn = np.empty((k, 9)), sensing.described_imu(sensors), np.zeros((k, 9))
         true[:, 6:8] = tilt = np.column_stack([late(angle, imu_s)[rows] for angle in (roll, -grade)])
         true[:, :2] = np.gradient(tilt, 1.0 / IMU_HZ, axis=0)
@@ -1470,14 +1448,13 @@ def run_planar(
             late(GRAVITY_MPS2 * np.cos(roll) * level, imu_s)[rows],
         )
         true[:, 8] = (np.cumsum(true[:, 2]) - true[0, 2]) / IMU_HZ
-        if noise is not None:
-            sizes = np.repeat([noise["gyro_radps"], noise["accel_mps2"]], 3)
-            forget = np.repeat([noise["gyro_s"], noise["accel_s"]], 3)
-            vibration = coloured(rng.standard_normal((6, k)), sizes, forget, 1.0 / IMU_HZ)
-            still = np.repeat([sensors.gyro_std_radps, sensors.accel_std_mps2], 3)
-            drawn[:, :6] = vibration * late(active, imu_s)[rows, None] + still * rng.standard_normal((k, 6))
-            drawn[:, 6:8] = noise["tilt_rad"] * rng.standard_normal((k, 2))
-            drawn[:, 8] = sensors.yaw_std_rad * rng.standard_normal(k)
+        vibration = shaken(
+            "imu", "gyro gyro gyro accel accel accel", "radps radps radps mps2 mps2 mps2", IMU_HZ
+        )
+        still = np.repeat([sensors.gyro_std_radps, sensors.accel_std_mps2], 3)
+        drawn[:, :6] = vibration * late(active, imu_s)[rows, None] + still * white("imu", k, 6)
+        drawn[:, 6:8] = levels["tilt_rad"] * white("imu", k, 2)
+        drawn[:, 8] = sensors.yaw_std_rad * white("imu", k)
         biases = np.tile(bias, (k, 1))
         biases[:, 6:8] = p["roll_offset_rad"], -p["pitch_offset_rad"]
         yaw_rate = bias[2] + drawn[:, 2]  # the fused yaw sums the measured rate
@@ -1485,22 +1462,17 @@ def run_planar(
         streams["imu"] = Stream(time_s, sensing.imu_values(true, scale, biases, drawn), IMU_CHANNELS)
 
         rows, time_s = samples(CAMERA_HZ)
-        k, rng = len(rows), rngs["camera"]
+        k = len(rows)
         seen = np.column_stack([ideal[SPEED_X][rows], ideal[SPEED_Y][rows]])
-        if noise is not None:
-            std, tau_s = [noise["camera_mps"]] * 2, [noise["camera_s"]] * 2
-            drawn = coloured(rng.standard_normal((2, k)), std, tau_s, 1.0 / CAMERA_HZ)
-            seen += drawn * late(active, camera_s)[rows, None]
-            seen += camera.speed_std_mps * rng.standard_normal((k, 2))
+        seen += shaken("camera", "camera camera", "mps mps", CAMERA_HZ) * late(active, camera_s)[rows, None]
+        seen += camera.speed_std_mps * white("camera", k, 2)
         channels = ("speed_x_mps", "speed_y_mps")
         if isinstance(robot, SwerveRobot):  # a tracking camera integrates its own pose
             turned_rad = ideal[HEADING]
             yaw = ((np.cumsum(turned_rad) - 0.5 * (turned_rad + turned_rad[0])) * dt)[rows]
-            rate, position_noise = turned_rad[rows], np.zeros((k, 2))
-            if noise is not None:
-                yaw = yaw + camera.yaw_std_rad * rng.standard_normal(k)
-                rate = rate + camera.yaw_rate_std_radps * rng.standard_normal(k)
-                position_noise = camera.position_std_m * rng.standard_normal((k, 2))
+            yaw = yaw + camera.yaw_std_rad * white("camera", k)
+            rate = turned_rad[rows] + camera.yaw_rate_std_radps * white("camera", k)
+            position_noise = camera.position_std_m * white("camera", k, 2)
             ahead, left = point_velocity(seen[:, 0], seen[:, 1], rate, -camera.lever_x_m, -camera.lever_y_m)
             velocity = np.column_stack(
                 [ahead * np.cos(yaw) - left * np.sin(yaw), ahead * np.sin(yaw) + left * np.cos(yaw)]
@@ -1553,19 +1525,15 @@ def run_planar(
         more[BODY_SLIP] = moved["slip_ratio"]
     streams["truth"] = sensing.truth_stream(time_s, body, robot.wheels, of_wheels, more)
     if steered:
-        shown, error, step_rad = steer[::every, :steered], np.zeros(1), 0.0
-        if noise is not None:
-            error = sensors.steering_std_rad * rngs["steering"].standard_normal(shown.shape)
-            if sensors.steering_steps_ratio > 0.0:
-                step_rad = 2.0 * math.pi / sensors.steering_steps_ratio
+        shown, steps = steer[::every, :steered], sensors.steering_steps_ratio
+        error = sensors.steering_std_rad * white("steering", *shown.shape)
+        step_rad = 2.0 * math.pi / steps if loud and steps > 0.0 else 0.0
         shown = sensing.encoder_angle(shown, robot.steering_zeros_rad[:steered], error, step_rad)
         streams["steering"] = Stream(wheels_s, shown, robot.steer_channels)
     if heading:  # central differences of a heading that does not depend on the gyro
         rows, time_s = samples(CAMERA_HZ)
-        rate = ideal[HEADING][rows]
-        if noise is not None:
-            headings = noise["heading_rad"] * rngs["lidar"].standard_normal(len(rows))
-            rate = rate + np.gradient(headings, 1.0 / CAMERA_HZ)
+        headings = levels["heading_rad"] * white("lidar", len(rows))
+        rate = ideal[HEADING][rows] + np.gradient(headings, 1.0 / CAMERA_HZ)
         streams["lidar"] = Stream(time_s, rate[:, None], ("yaw_rate_radps",))
     if fixes:
         at_s = np.arange(0.0, (len(body) - 1) / IMU_HZ + 1e-9, 1.0 / sensing.RAW_HZ)

@@ -260,12 +260,46 @@ def track_forces(
     weight = tracks.mass_kg * GRAVITY_MPS2
     out[0], out[1] = -weight * math.sin(grade_rad), -weight * math.sin(roll_rad) * math.cos(grade_rad)
     out[2] = 0.0
-    left, right, ahead = track_loads(tracks, grade_rad, roll_rad)
+    left, right, ahead_m = track_loads(tracks, grade_rad, roll_rad)
+    length, passive = tracks.length_m, tracks.passive_ratio
+    step = length / ELEMENTS
     for side in range(2):
-        load = left if side == 0 else right
+        belt, load_n = belt_mps[side], left if side == 0 else right
         y = tracks.half_m if side == 0 else -tracks.half_m
-        heap = inner_share(twist, y) * heap_m2
-        _add_track(tracks, belt_mps[side], twist, load, ahead, y, heap, out)
+        front = 0.5 * length if belt >= 0.0 else -0.5 * length
+        creep = max(abs(belt), CREEP_MPS)
+        along = belt - twist[0] + twist[2] * y
+        # force on each metre of a side that pushes soil of the rut's depth, and of the heap on it
+        depth = rut_depth(tracks, load_n)
+        cohesive = 2.0 * tracks.cohesion_pa * depth * math.sqrt(passive)
+        square, heap = depth * depth, 2.0 * (inner_share(twist, y) * heap_m2)
+        flank = tracks.bulldozing_ratio * (0.5 * UNIT_WEIGHT_NPM3 * square * passive + cohesive)
+        heaped = tracks.bulldozing_ratio * (0.5 * UNIT_WEIGHT_NPM3 * (square + heap) * passive + cohesive)
+        for i in range(ELEMENTS):
+            x = 0.5 * length - (i + 0.5) * step
+            age = abs(front - x) / creep
+            across = -(twist[1] + twist[2] * x)
+            slid_x, slid_y = along * age, -(twist[1] + twist[2] * 0.5 * (x + front)) * age
+            pressure = load_n / tracks.area_m2 * (1.0 + 12.0 * ahead_m * x / (length * length))
+            stress = tracks.cohesion_pa + pressure * tracks.tan_friction
+            stress *= -math.expm1(-math.hypot(slid_x, slid_y) / tracks.shear_modulus_m)
+            slides = math.sqrt(along * along + across * across + SLIDING_MPS**2)
+            per_speed = stress * tracks.width_m * step / slides
+            force_x, force_y = per_speed * along, per_speed * across
+            if flank > 0.0:
+                pushed = heaped if across * y < 0.0 else flank  # the inner track's side that faces the turn
+                share = -math.expm1(-abs(slid_y) / MOBILISED_M)
+                force_y += pushed * share * step * across / math.sqrt(across * across + SLIDING_MPS**2)
+            out[0] += force_x
+            out[1] += force_y
+            out[2] += x * force_y - y * force_x
+        moving, resists = twist[0] - twist[2] * y, tracks.rolling_ratio * load_n
+        if depth > 0.0:
+            modulus_b = tracks.kc_npmn1 + tracks.width_m * tracks.kphi_npmn2
+            resists += compaction_resistance(depth, modulus_b, tracks.exponent_ratio)
+        resists *= moving / math.sqrt(moving * moving + ROLLING_MPS**2)
+        out[0] -= resists
+        out[2] += y * resists
 
 
 @njit
@@ -285,64 +319,6 @@ def inner_share(twist: Array, y: float) -> float:
     side = twist[0] * twist[2] * y
     tight = abs(twist[0]) / (abs(twist[0]) + turning)
     return 0.5 * (1.0 + math.copysign(tight, side))
-
-
-@inner
-def _add_track(
-    tracks: Any,
-    belt_mps: float,
-    twist: Array,
-    load_n: float,
-    ahead_m: float,
-    y: float,
-    heap_m2: float,
-    out: Array,
-) -> None:
-    """Add the forces of one track."""
-    length, width, modulus = tracks.length_m, tracks.width_m, tracks.shear_modulus_m
-    step = length / ELEMENTS
-    front = 0.5 * length if belt_mps >= 0.0 else -0.5 * length
-    creep = max(abs(belt_mps), CREEP_MPS)
-    along = belt_mps - twist[0] + twist[2] * y
-    depth = rut_depth(tracks, load_n)
-    flank = _earth_pressure(tracks, depth, 0.0)
-    heaped = _earth_pressure(tracks, depth, heap_m2)
-    for i in range(ELEMENTS):
-        x = 0.5 * length - (i + 0.5) * step
-        age = abs(front - x) / creep
-        across = -(twist[1] + twist[2] * x)
-        slid_x, slid_y = along * age, -(twist[1] + twist[2] * 0.5 * (x + front)) * age
-        pressure = load_n / tracks.area_m2 * (1.0 + 12.0 * ahead_m * x / (length * length))
-        stress = tracks.cohesion_pa + pressure * tracks.tan_friction
-        stress *= -math.expm1(-math.hypot(slid_x, slid_y) / modulus)
-        per_speed = stress * width * step / math.sqrt(along * along + across * across + SLIDING_MPS**2)
-        force_x, force_y = per_speed * along, per_speed * across
-        if flank > 0.0:
-            pushed = heaped if across * y < 0.0 else flank  # the inner track's side that faces the turn
-            share = -math.expm1(-abs(slid_y) / MOBILISED_M)
-            force_y += pushed * share * step * across / math.sqrt(across * across + SLIDING_MPS**2)
-        out[0] += force_x
-        out[1] += force_y
-        out[2] += x * force_y - y * force_x
-    moving = twist[0] - twist[2] * y
-    resists = tracks.rolling_ratio * load_n
-    if depth > 0.0:
-        modulus_b = tracks.kc_npmn1 + tracks.width_m * tracks.kphi_npmn2
-        resists += compaction_resistance(depth, modulus_b, tracks.exponent_ratio)
-    resists *= moving / math.sqrt(moving * moving + ROLLING_MPS**2)
-    out[0] -= resists
-    out[2] += y * resists
-
-
-@inner
-def _earth_pressure(tracks: Any, depth_m: float, heap_m2: float) -> float:
-    """Return the force on each metre of a side that pushes soil of a depth, and of a heap on it."""
-    if tracks.bulldozing_ratio == 0.0:
-        return 0.0
-    square = depth_m * depth_m + 2.0 * heap_m2
-    passive = tracks.passive_ratio
-    cohesive = 2.0 * tracks.cohesion_pa * depth_m * math.sqrt(passive)
-    return float(tracks.bulldozing_ratio * (0.5 * UNIT_WEIGHT_NPM3 * square * passive + cohesive))
 
 
 @njit

@@ -228,7 +228,7 @@ def _gram(
         for sign in (1.0, 0.0) if name in ONE_SIDED else (1.0, -1.0):
             p = vector_of({name: sign * step})
             if name in SENSED_ONLY:
-                both.append(sense(planar, p, 1 / rate_hz, plain))
+                both.append(sense(planar.body, p, 1 / rate_hz, plain))
             else:
                 both.append(_predict(planar, p, 1 / rate_hz, wheel_speed, steer, grade, roll))
         span = step if name in ONE_SIDED else 2 * step
@@ -257,7 +257,7 @@ def _predict(
     wheel_speeds = wheel_speed + lag * np.gradient(wheel_speed, dt, axis=0) if lag else wheel_speed
     tilt = grade - p[INDEX["pitch_offset_rad"]], roll - p[INDEX["roll_offset_rad"]]
     truth = move(planar, p, dt, wheel_speeds, steer, *tilt, np.zeros((0, 3)))
-    return np.asarray(sense(planar, p, dt, truth))
+    return np.asarray(sense(planar.body, p, dt, truth))
 
 
 def _density(
