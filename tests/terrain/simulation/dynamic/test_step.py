@@ -314,33 +314,6 @@ def test_a_robot_at_rest_on_a_slope_of_5_degrees_does_not_move(name, uphill_rad)
     )
 
 
-def test_mirrored_commands_give_mirrored_motion():
-    """Fore and aft are alike: wheels 1 and 2 change places, angles and rates their signs."""
-    rng = np.random.default_rng(2)
-    wheel, steer = 5 * rng.random((100, 3)), np.cumsum(0.08 * rng.standard_normal((100, 3)), axis=0)
-    noise, swap = rng.standard_normal((2000, 3)), [1, 0, 2]
-    motions = []
-    for sign, order in ((1.0, [0, 1, 2]), (-1.0, swap)):
-        plant = plant_of(
-            load_soil("grass"), roughness_m3=1e-3, grade_ratio=(sign * 0.05, 0.03), backlash_rad=0.02
-        )
-        rows, state = np.empty(2000, BODY_ROW), start_state(np.zeros(3))
-        args = (np.repeat(sign * a[:, order], SUBSTEPS, axis=0) for a in (wheel, steer))
-        advance(*plant, state, *args, np.ascontiguousarray(noise[:, order]), rows)
-        motions.append(Motion(rows))
-    there, mirrored = motions
-    body = "yaw_rad speed_x_mps yaw_rate_radps ride_pitch_rad"
-    body = dict.fromkeys(body.split(), -1) | dict.fromkeys(
-        ["accel_y_mps2", "ride_z_mps2", "ride_roll_rad"], 1
-    )
-    for name, sign in body.items():
-        twin = sign * there.record[name]
-        np.testing.assert_allclose(mirrored.record[name], twin, rtol=0, atol=1e-7, err_msg=name)
-    for name, sign in {"wheel_radps": -1, "steer_rad": -1, "normal_n": 1, "slip_ratio": -1}.items():
-        twin = sign * wheels(there)[name][:, swap]
-        np.testing.assert_allclose(wheels(mirrored)[name], twin, rtol=0, atol=1e-4, err_msg=name)
-
-
 @pytest.mark.parametrize("leg_backlash_rad", [0.0, 0.03])
 def test_motor_work_in_curves_is_dissipated_by_lateral_slip_too(leg_backlash_rad):
     soil = load_soil("grass")

@@ -161,7 +161,7 @@ def a_contact_for_each_wheel(robot, ground, wheel_speed, steer, dt):
 
 
 def test_three_wheels_that_slip_each_by_itself_move_as_one_twist_that_slips():
-    robot, dt, n = still(AGRIMARO), 1e-3, 12000
+    robot, dt, n = still(AGRIMARO), 1e-3, 7000
     robot = robot.with_parts(sensors=replace(robot.sensors, encoder_time_constant_s=0.0, imu_latency_s=0.0))
     ground = Ground(slip_ratio=1.2, rolling_ratio=0.08)
     t = dt * np.arange(n)

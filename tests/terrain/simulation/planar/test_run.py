@@ -8,7 +8,6 @@ import pytest
 from scipy.signal import welch
 from studies.blind_trials.limits import noise_psd
 
-from terrain.constants import GRAVITY_MPS2
 from terrain.discrepancy.runs import signals_of
 from terrain.effects import (
     ACCEL,
@@ -123,19 +122,13 @@ def test_true_slip_is_that_of_the_radii_that_the_wheels_have(robot):
 
 
 @pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)
-def test_tilt_follows_the_heading_and_gravity_the_tilt(robot):
+def test_tilt_follows_the_heading(robot):
     twist = steady(0.5, 40.0, 0.3)
     run = simulate(robot, twist, Ground(slip_ratio=0.0), 0, conditions=Conditions(grade_ratio=(0.1, 0.0)))
-    truth, imu = run.streams["truth"], run.streams["imu"]
+    truth = run.streams["truth"]
     yaw = truth.channel("yaw_rad")
     np.testing.assert_allclose(np.tan(truth.channel("roll_rad")), -0.1 * np.sin(yaw), atol=1e-9)
     np.testing.assert_allclose(truth.channel("pitch_rad"), -0.1 * np.cos(yaw), atol=1e-3)
-    shift = round(100 * robot.sensors.imu_latency_s) + 1
-    turn, v = truth.channel("yaw_rate_radps"), truth.channel("speed_x_mps")
-    up = GRAVITY_MPS2 * np.sin(-truth.channel("pitch_rad"))
-    np.testing.assert_allclose(imu.channel("accel_x_mps2")[200:], up[200:], atol=0.01 * shift)
-    side = turn * v + GRAVITY_MPS2 * np.sin(truth.channel("roll_rad"))
-    np.testing.assert_allclose(imu.channel("accel_y_mps2")[200:], side[200:], atol=0.01 * shift)
     undulation = simulate(
         robot, steady(0.8, 120.0), Ground(), 4, conditions=Conditions(undulation_ratio=0.05)
     ).streams["truth"]
@@ -169,7 +162,7 @@ def test_noise_of_every_channel_has_the_stated_density(robot):
     speed, ground = 0.6, Ground()
     # coarse steps of an encoder beat with its samples at a steady speed, and are no noise
     fine = replace(robot.sensors, hall_steps_ratio=20 * robot.sensors.hall_steps_ratio)
-    robot, twist = robot.with_parts(sensors=fine), steady(speed, 1500.0)
+    robot, twist = robot.with_parts(sensors=fine), steady(speed, 600.0)
     noisy, quiet = (
         noisy_signals(robot, simulate(robot, twist, ground, 7, noise=noise, heading=True))
         for noise in (NOISE, None)
