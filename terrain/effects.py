@@ -202,9 +202,8 @@ class Effect(NamedTuple):
     sensed_only: bool = False  #: it changes what sensors measure, and not the motion of the body
     stage: Stage | None = None  #: where it acts in the dynamic simulation, of the robots that that simulates
     aliases: tuple[str, ...] = ()  #: other names of the same effect, which no log distinguishes from it
-    twins: tuple[
-        tuple[str, str], ...
-    ] = ()  # effects that look the same, and the channel that distinguishes them
+    twins: tuple[tuple[str, str], ...] = ()
+    """Effects that look the same, and the channel that distinguishes them."""
     deprecated: tuple[str, ...] = ()  #: former names, accepted on the command line
     words: Callable[[Sequence[Term]], str] | None = None
     """What its values make of the robot, as the object of "with"; by default the number of its home, or the values."""
@@ -231,10 +230,8 @@ def effect(
 
 # -- Words: what a value makes of the robot -------------------------------------------------------------------
 
-EXAMPLE_RADPS, EXAMPLE_MPS = (
-    0.5,
-    1.0,
-)  #: The turn and the speed at which losses that grow with them are stated.
+#: The turn and the speed at which losses that grow with them are stated.
+EXAMPLE_RADPS, EXAMPLE_MPS = 0.5, 1.0
 FAST_RADPS, FAST_MPS = 1.0, 2.0  #: The same of what fast turns do.
 #: Yaw rate from which the wheels mostly slide sideways, and below which they mostly deflect; of a Warthog on asphalt
 #: and gravel.
@@ -1112,13 +1109,10 @@ def read_effects_of(texts: Iterable[str], drive: str) -> dict[str, float]:
     return acting
 
 
-PARAMETERS: tuple[str, ...] = (
-    *PARAMETER,
-    *(p.name for p in TILT_OFFSETS),
-)  #: Order of the numbers in the vector.
-INDEX: dict[str, int] = {
-    name: i for i, name in enumerate(PARAMETERS)
-}  #: Place of each parameter in the vector.
+#: Order of the numbers in the vector.
+PARAMETERS: tuple[str, ...] = (*PARAMETER, *[p.name for p in TILT_OFFSETS])
+#: Place of each parameter in the vector.
+INDEX: dict[str, int] = {name: i for i, name in enumerate(PARAMETERS)}
 #: The vector as a record: ``vector.view(EFFECTS)[0]`` has the parameters by name.
 EFFECTS = record(dict.fromkeys(PARAMETERS, float))
 
