@@ -10,7 +10,7 @@ What is later without a jump is late, however long, and left out.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -317,10 +317,9 @@ class SampleQueue:
         """Queue samples."""
         samples = np.ascontiguousarray(values[:, self._columns])  # one layout: one compiled form
         samples[:, self._is_lacking] = np.nan
-        finite = np.isfinite(samples)
+        finite = np.isfinite(samples) | self._is_lacking
         samples[~finite] = np.nan
-        finite[:, self._is_lacking] = True
-        waiting, are_whole = self.waiting, np.all(finite, axis=1).tolist()
+        waiting, are_whole = self.waiting, finite.all(axis=1).tolist()
         for stamp_s, is_whole, sample in zip(time_s.tolist(), are_whole, samples, strict=True):
             place = bisect_left(waiting, stamp_s, key=itemgetter(0))
             is_known = place < len(waiting) and waiting[place][0] == stamp_s
@@ -343,7 +342,7 @@ class SampleQueue:
     def take(self, time_s: float) -> Due:
         """Take out what came by a tick; what is stamped far ahead of it goes."""
         waiting = self.waiting
-        n = next((k for k, (stamp_s, _, _) in enumerate(waiting) if stamp_s > time_s + TICK_S), len(waiting))
+        n = bisect_right(waiting, time_s + TICK_S, key=itemgetter(0))
         due = waiting[:n]
         del waiting[:n]
         if due:

@@ -276,8 +276,8 @@ class Live(ABC):
             reading = Reading(reading.time_s, np.full((reading.time_s.size, n_columns), np.nan))
         elif self._correction is not None:
             reading = Reading(*self._correction(name, self._channels[name], *reading))
-        finite = np.isfinite(reading.time_s)
-        if not finite.all():
+        if not math.isfinite(sum(reading.time_s.tolist())):
+            finite = np.isfinite(reading.time_s)
             self._counted[f"{name}: stamp does not increase"] += int((~finite).sum())
             reading = Reading(reading.time_s[finite], reading.values[finite])
         return reading if reading.time_s.size else None
