@@ -116,10 +116,9 @@ class OdometrySettings(NamedTuple):
     fix_std_m: float = 0.02  #: of a position along an axis, and of a heading
     yaw_fix_std_rad: float = 0.02
     ratio_std: float = 0.1  #: of the ratio of the tracks' yaw rate and the gyro's, from turn to turn
-    forget_s: float = math.inf  #: time in which a parameter may change by its standard deviation at the start
 
 
-DEFAULTS = OdometrySettings()
+DEFAULTS, NO_SLIP = OdometrySettings(), SlipModel()
 
 # Places in `params`: half the distance of the tracks, the correlation time, and as inputs those of a tick.
 _HALF, _CORRELATION, _LEFT, _RIGHT, _GYRO, _ROLL, _PITCH, _DISPLACEMENT = range(8)
@@ -320,8 +319,6 @@ class SlipOdometry(FilterObserver):
             if self._is_located:
                 z[:3] = fix
             by_tracks = (used[1] - used[0]) / (2.0 * self._half_m)
-            if not stands:
-                walk[_MODEL] = self._prior**2 / settings.forget_s
             if not stands and dt_s > 0.0 and abs(used[2]) > TURNING_RADPS and used[2] * by_tracks > 0.0:
                 z[3] = by_tracks / used[2]
                 variance[3] *= max(2.0 * self._model.correlation_s / dt_s, 1.0)
@@ -377,15 +374,13 @@ class SlipOdometry(FilterObserver):
         return ObserverOutput(mean[:d], std[:d], slip[:n], slip_std[:n], int(status))
 
 
-def plain_odometry(
-    name: str, robot: TrackedRobot, model: SlipModel | None = None, settings: OdometrySettings = DEFAULTS
-) -> SlipOdometry:
+def plain_odometry(name: str, robot: TrackedRobot, model: SlipModel = NO_SLIP) -> SlipOdometry:
     """Return one of the odometries that know no slip, or of turns alone; see the table of this module.
 
     Parameters
     ----------
     name : ``encoder-odometry``, ``gyrodometry`` or ``endo``
-    robot, settings : as of :class:`SlipOdometry`; a threshold of the gyro is that of gyrodometry
+    robot : its tracks
     model : its effective distance of the tracks is that of encoder odometry, its exponent that of Endo's law
 
     Examples
@@ -394,7 +389,6 @@ def plain_odometry(
     >>> plain_odometry("encoder-odometry", load_robot("patako"), SlipModel(track_ratio=1.5)).slips
     ()
     """
-    model = model or SlipModel()
     covariance = np.zeros((N_MODEL, N_MODEL))
     covariance[TRACK_RATIO, TRACK_RATIO] = TRACK_STD_RATIO**2
     known = SlipModel(
@@ -404,10 +398,6 @@ def plain_odometry(
         run_slip_std_ratio=UNKNOWN_SLIP_RATIO,
         run_angle_std_rad=UNKNOWN_ANGLE_RAD,
     )
-    threshold = {
-        "encoder-odometry": math.inf,
-        "gyrodometry": settings.gyro_threshold_radps or GYRODOMETRY_THRESHOLD_RADPS,
-        "endo": settings.gyro_threshold_radps,
-    }[name]
-    settings = settings._replace(gyro_threshold_radps=threshold)
+    thresholds = {"encoder-odometry": math.inf, "gyrodometry": GYRODOMETRY_THRESHOLD_RADPS, "endo": 0.0}
+    settings = OdometrySettings(gyro_threshold_radps=thresholds[name])
     return SlipOdometry(robot, known, settings, name, SLIPS[:2] if name == "endo" else ())

@@ -65,12 +65,11 @@ slip that the model does not know, sideways on a slope or of a dragged track, is
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from terrain.angles import wrapped
-from terrain.errors import ConfigError
 from terrain.estimation.models.observer import Observer, ObserverOutput, ObserverStatus
 from terrain.records import Array
 from terrain.robots import TrackedRobot
@@ -94,8 +93,7 @@ _PUSHED_RADPS = 0.05  # above the bias of a gyro
 _LONGEST_S = 1e9  # at which clocks of a memory stop
 
 
-@dataclass(frozen=True)
-class TrackedSettings:
+class TrackedSettings(NamedTuple):
     """Gains, noise and limits; the defaults are the gains of the paper, both matrices the identity."""
 
     #: l_1, l_2 and l_3 of (8), of position and heading
@@ -211,11 +209,6 @@ class TrackedObserver(Observer):
     robot : tracked
     settings : gains, noise and limits
 
-    Raises
-    ------
-    ConfigError
-        if a setting is not above zero and finite; the walk may be 0.
-
     Examples
     --------
     >>> from terrain.estimation.models.observer import observe
@@ -231,11 +224,6 @@ class TrackedObserver(Observer):
     name, states, slips, rows = "tracked", STATES, SLIPS, ROWS
 
     def __init__(self, robot: TrackedRobot, settings: TrackedSettings = IN_MANOEUVRES) -> None:
-        for name, value in asdict(settings).items():
-            for number in value if isinstance(value, tuple) else (value,):
-                may_be_zero = name == "eta_walk_ratio"
-                if name != "normalised" and not (0 < number < math.inf or (may_be_zero and number == 0)):
-                    raise ConfigError(f"{name} is {number:g}, a finite number above zero is required")
         self._settings, self._half_m = settings, robot.half_track_m
         self._variance = np.square([settings.position_std_m, settings.position_std_m, settings.yaw_std_rad])
         self.eta, self._was_observed = np.ones(2), np.zeros(2, bool)
@@ -320,33 +308,32 @@ class TrackedObserver(Observer):
                 self._direction[j] = math.copysign(1.0, speed)
 
     def _take_fix(self, fix: Array) -> ObserverStatus | None:
-        """Use, reject or begin anew at a fix; return the status that it gives, None for none of its own."""
-        settings, has_started = self._settings, self._has_started
+        """Use, reject or begin anew at a fix; return the status that it gives, None for none of its own.
+
+        It is plausible where noise, and efficiencies from 0 to 2, explain how it deviates from dead reckoning.
+        """
+        settings, has_started, path_m = self._settings, self._has_started, self._path_m
         if not (np.abs(fix[:2]).max() <= _FURTHEST_M and math.isfinite(fix[2])):
             return ObserverStatus.REJECTED
-        if has_started and not self._is_plausible(fix):
-            self._n_rejected += 1
-            if self._n_rejected < settings.n_reset:
-                return ObserverStatus.REJECTED
-        elif has_started and not self._is_broken and self._span_s <= settings.longest_interval_s:
-            if self._span_s > 1e-6:
-                self._correct(fix)
-            return None
+        if has_started:
+            off_x, off_y = (fix - self._fix - self._travel @ self.eta)[:2].tolist()
+            n_std = math.sqrt(2.0) * settings.gate_std
+            turn = n_std * settings.yaw_std_rad + path_m / self._half_m
+            is_near = math.hypot(off_x, off_y) <= n_std * settings.position_std_m + path_m
+            is_near = is_near and abs(wrapped(float(fix[2]) - self._heading_rad)) <= turn
+            if not (self._is_broken or is_near):
+                self._n_rejected += 1
+                if self._n_rejected < settings.n_reset:
+                    return ObserverStatus.REJECTED
+            elif not self._is_broken and self._span_s <= settings.longest_interval_s:
+                if self._span_s > 1e-6:
+                    self._correct(fix)
+                return None
         self._has_started, self._fix, self._error = True, fix, np.zeros(3)
         self.cov[:3, :], self.cov[:, :3], self._cross = 0.0, 0.0, np.zeros((5, 3))
         self.cov[:3, :3], self._cross[:3] = np.diag(self._variance), -np.diag(self._variance)
         self._begin_interval(float(fix[2]))
         return ObserverStatus.RESET if has_started else None
-
-    def _is_plausible(self, fix: Array) -> bool:
-        """Return whether noise, and efficiencies from 0 to 2, explain how a fix deviates from dead reckoning."""
-        if self._is_broken:
-            return True
-        off_x, off_y = (fix - self._fix - self._travel @ self.eta)[:2].tolist()
-        n_std = math.sqrt(2.0) * self._settings.gate_std
-        turn = n_std * self._settings.yaw_std_rad + self._path_m / self._half_m
-        near = math.hypot(off_x, off_y) <= n_std * self._settings.position_std_m + self._path_m
-        return near and abs(wrapped(float(fix[2]) - self._heading_rad)) <= turn
 
     def _correct(self, fix: Array) -> None:
         """Integrate the observer from the last fix to this one."""
