@@ -315,7 +315,7 @@ def run_car(
                 stops, stood_s = stops[1:], 0.0
         row = measured[k]
         row += (*(body[name] for name in _MEASURED), lateral(body))
-        row[0] *= speed != 0.0  # the encoder of a wheel that stands counts nothing
+        row[0] = row[0] if speed else 0.0  # the encoder of a wheel that stands counts nothing
         row[4] = wrapped(float(row[4]))
         if k % round(FIX_S / TICK_S):
             row[2:5] = np.nan
