@@ -884,9 +884,7 @@ def load_robot(name_or_path: str | Path) -> Robot:
     0.5708
     """
     name = str(name_or_path)
-    if (
-        name not in _READ
-    ):  # one of the package is read once a process: it takes 30 ms, and a robot never changes
+    if name not in _READ:
         robot = robot_from(*read_description(name_or_path))
         if name not in robot_names():
             return robot
@@ -894,6 +892,7 @@ def load_robot(name_or_path: str | Path) -> Robot:
     return _READ[name]
 
 
+# A robot of the package is read once a process: it takes 30 ms, and a robot never changes.
 _READ: dict[str, Robot] = {}
 
 

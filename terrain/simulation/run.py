@@ -111,6 +111,7 @@ def simulate(
 
     Examples
     --------
+    >>> from terrain.simulation.plants.planar import Ground
     >>> twist = np.zeros((501, 3))
     >>> twist[50:, 0] = 0.5
     >>> run = simulate(load_robot("husky"), twist, Ground(), 0, effects={"wheel_radius_ratio": -0.1})
