@@ -547,7 +547,7 @@ KEYS = {
     AMPS: "the currents {:.3g} times",
     H: "the heading rate {:.3g} times",
 }
-_MOVING = [i for i, c in enumerate(KEYS) if c != AMPS]
+_MOVING = np.array([c != AMPS for c in KEYS])
 
 #: Readings, and what they add to the logarithms of gains (readings, keys): see :func:`options_of`.
 Options = tuple[list[Changes], Array]
@@ -597,13 +597,16 @@ def _unit_faults(runs: Sequence[Rows], robot: Robot) -> tuple[Fault, ...]:
     middle, scatter = _medians(logs[usual]), 1.48 * _medians(np.abs(logs[usual] - _medians(logs[usual])))
     near = np.clip(SCATTERS * np.where(np.isfinite(scatter), scatter, TIGHT), TIGHT, NEAR)
     of_runs: dict[Changes, list[int]] = {}
+    n_changes = np.array([len(each) for each in changes])
     for i in (i for i in informed if own[i]):
         off = np.where(fit[i] > CLEAR_FIT, logs[i], np.nan) - middle
         left = np.abs(_after(off, adds))
-        distance = np.nansum(left, axis=1) + [COST * (len(each) - 1) for each in changes]
-        wrong = [not each or not _agrees(off, after, near) for each, after in zip(changes, left, strict=True)]
-        distance[wrong] = np.inf
-        if np.isfinite(distance).any():
+        agrees = (np.nan_to_num(left) <= near).all(axis=1) & (n_changes > 0) & (np.abs(off) > 2 * NEAR).any()
+        small, sound = (off < -2 * NEAR) & _MOVING, (np.abs(off) < near) & _MOVING
+        if small.any():  # it may just stall, unless another channel shows that it moved
+            agrees &= (left[:, small] < TIGHT).all(axis=1) & (small.sum() + sound.sum() > 1)
+        if agrees.any():
+            distance = np.where(agrees, np.nansum(left, axis=1) + COST * n_changes, np.inf)
             of_runs.setdefault(changes[int(np.argmin(distance))], []).append(i)
     return tuple(
         fault(reading, change, (), has)
@@ -667,16 +670,6 @@ def likeliest(logs: Array, options: Options, robot: Robot) -> tuple[Changes, lis
         return (), []
     near = (total - total[best] < UNIT_TIE) & (n_changes == n_changes[best])
     return changes[best], [changes[i] for i in np.flatnonzero(near).tolist() if i != best]
-
-
-def _agrees(off: Array, after: Array, near: Array) -> bool:
-    """Whether a run that is off from the others agrees with them after changes, and may not just stall."""
-    known = np.isfinite(off)
-    if not known.any() or (after[known] > near[known]).any() or not (np.abs(off[known]) > 2 * NEAR).any():
-        return False
-    small = [i for i in _MOVING if known[i] and off[i] < -2 * NEAR]
-    sound = [i for i in _MOVING if known[i] and abs(off[i]) < near[i]]  # these show that it moved
-    return not small or (bool((after[small] < TIGHT).all()) and len(small) + len(sound) > 1)
 
 
 # -- Constant offsets of sensors that no bias of the catalogue reaches: sensors not zeroed, or turned ------

@@ -105,29 +105,19 @@ def find_axes(
     turn, gyro, gained, x, across, y, z = np.concatenate(parts).T
     if len(turn) < MIN_SAMPLES:
         return default
-    of_gyro = _correlation(turn, gyro)
-    gyro_z = default.gyro_z
+    of_gyro, gyro_z = _correlation(turn, gyro), default.gyro_z
     if abs(of_gyro) >= MIN_GYRO_CORRELATION:
         per_m = float(np.abs(turn @ gyro) / (turn @ turn))
-        gyro_z = np.copysign(np.deg2rad(1.0) if per_m > MAX_TURN_PER_M else 1.0, of_gyro)
-    evidence = [_correlation(gained, x), _correlation(across, y)]
-    level = float(np.median(z))
-    signs = [np.sign(r) if abs(r) >= MIN_CORRELATION else 0.0 for r in evidence]
-    signs.append(np.sign(level) if abs(level) >= MIN_SIGN_GRAVITY_MPS2 else 0.0)
-    return ImuAxes(_rotation(signs, evidence, default.accel), float(gyro_z))
-
-
-def _rotation(
-    signs: Sequence[float], evidence: Sequence[float], default: tuple[float, float, float]
-) -> tuple[float, float, float]:
-    """Return signs whose product is 1: two that are certain give the third."""
-    x, y, z = (float(sign) for sign in signs)
-    if x and y and z and x * y * z < 0:  # no rotation: what is less certain follows
-        x, y = (x, 0.0) if abs(evidence[0]) > abs(evidence[1]) else (0.0, y)
-    if (x, y, z).count(0.0) > 1:
-        return default
-    x, y, z = x or y * z, y or x * z, z or x * y
-    return x, y, z
+        gyro_z = float(np.copysign(np.deg2rad(1.0) if per_m > MAX_TURN_PER_M else 1.0, of_gyro))
+    along, sideways, level = _correlation(gained, x), _correlation(across, y), float(np.median(z))
+    one = float(np.sign(along)) if abs(along) >= MIN_CORRELATION else 0.0
+    other = float(np.sign(sideways)) if abs(sideways) >= MIN_CORRELATION else 0.0
+    up = float(np.sign(level)) if abs(level) >= MIN_SIGN_GRAVITY_MPS2 else 0.0
+    if one * other * up < 0:  # no rotation: what is less certain follows
+        one, other = (one, 0.0) if abs(along) > abs(sideways) else (0.0, other)
+    if (one, other, up).count(0.0) > 1:
+        return ImuAxes(default.accel, gyro_z)
+    return ImuAxes((one or other * up, other or one * up, up or one * other), gyro_z)
 
 
 def _correlation(one: Array, other: Array) -> float:
