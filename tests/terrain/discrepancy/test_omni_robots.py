@@ -85,12 +85,11 @@ def test_a_hidden_effect_is_named_with_its_value_and_nothing_beside_it(hidden):
 def test_scale_of_a_camera_and_radius_of_the_wheels_are_one_on_straight_drives():
     """Only the torque of a larger wheel parts them: the answer is the scale, or either."""
     answers, both = [], ([], [{"camera_scale", "wheel_radius"}])
-    while both not in answers and len(answers) < 4:
-        runs = driven({"camera_scale_ratio": -0.08}, FREE, turns=False, seed=len(answers))
-        diagnosis = diagnosed(runs, FREE)
+    for seed in (2, 3):
+        diagnosis = diagnosed(driven({"camera_scale_ratio": -0.08}, FREE, turns=False, seed=seed), FREE)
         sets = [set(names) for names in diagnosis.ambiguous_sets]
         answers.append(([cause.name for cause in diagnosis.causes], sets))
-        assert answers[-1] in ((["camera_scale"], []), both)
+    assert all(answer in ((["camera_scale"], []), both) for answer in answers)
     assert both in answers
 
 
