@@ -225,12 +225,10 @@ def extended_effects(
 
 # -- The simulation that runs are compared with, on the terrain that each label names --------------------------
 
+#: Effective ratios that are tried; the best lies on the parabola through their losses.
 RATIOS = (0.0, 0.5, 1.0)
-"""Effective ratios that are tried; the best lies on the parabola through their losses."""
-
+#: All of the tilt counts as a slope, unless a smaller part fits better by that in minus twice the log-likelihood.
 TILT_LOSS = 20.0
-"""All of the tilt counts as a slope, unless a smaller part fits better by that in minus twice the
-log-likelihood."""
 
 
 def simulation_for(
@@ -251,17 +249,10 @@ def simulation_for(
     simulation = Simulation(robot, Ground(), robot.effects, spread_numbers("scatter"), grounds)
     if grounds:
         parameters = parameters_of(robot.drive)
-        common, varied, scatter = (
-            {name: size for name, size in spread_numbers(part).items() if name in parameters}
-            for part in ("model_error", "varied_error", "varied_scatter")
-        )
-        simulation = replace(
-            simulation,
-            model_error=common,
-            varied_error=varied,
-            varied_scatter=scatter,
-            probe_error=probe_error(),
-        )
+        errors: dict[str, Any] = {"probe_error": probe_error()}
+        for kind in ("model_error", "varied_error", "varied_scatter"):
+            errors[kind] = {n: size for n, size in spread_numbers(kind).items() if n in parameters}
+        simulation = replace(simulation, **errors)
     signals = [signals_of(run, robot) for run in runs] if grounds else []
     for label, ground in list(grounds.items()):
         own = [run for run in signals if run.terrain == label]

@@ -211,17 +211,8 @@ def test_a_session_is_named_also_where_a_run_of_it_drives_straight():
     assert "in all 5 runs of gravel" in fault.sentence
 
 
-def with_heading(run: RunLog) -> RunLog:
-    """Replace the camera by a lidar that measures a heading, too."""
-    imu, wheels, seen = (run.streams[name] for name in ("imu", "wheels", "odometry"))
-    yaw_rate = np.interp(seen.time_s, imu.time_s, imu.channel("gyro_z_radps"))
-    values = np.column_stack([seen.values, yaw_rate])
-    lidar = Stream(seen.time_s, values, (*seen.channels, "yaw_rate_radps"))
-    return replace(run, streams={"imu": imu, "wheels": wheels, "lidar": lidar})
-
-
 def test_a_heading_says_whether_the_gyro_or_the_wheels_are_turned():
-    runs = [with_heading(run) for run in sound(track=True)]
+    runs = [with_lidar(run, 0.0) for run in sound(track=True)]
     (gyro,) = faults(on_one_clock([WRITTEN["the gyro's sign"][0](run) for run in runs]))
     assert gyro.change.column is Column.GYRO
     assert "the heading rate with -1.00" in gyro.sentence
