@@ -18,17 +18,7 @@ from terrain.estimation.filter import (
     FilterSettings,
     run_filter,
 )
-from terrain.estimation.models import swerve
-from terrain.estimation.models.skid import (
-    WHEELS_AND_GYRO,
-    Motion,
-    StuckInterval,
-    make_skid_filter,
-    motion_seconds,
-    motion_track,
-    stuck_intervals,
-    within_bounds,
-)
+from terrain.estimation.models import skid, swerve
 from terrain.estimation.wheel_slip import SlipFigures, slip_figures, wheel_slip
 from terrain.extension import check_corrected, correct
 from terrain.kinematics.logged_wheels import with_wheel_speeds
@@ -86,8 +76,8 @@ class Estimate:
         if self.name != "skid":
             return None
         turn, bias_std = self.track.state("yaw_rate_radps"), self.track.std("gyro_bias_radps")
-        measured = self.table.columns(WHEELS_AND_GYRO)
-        return motion_track(self.track.time_s, measured, turn, bias_std, self.robot.track_m)
+        measured = self.table.columns(skid.WHEELS_AND_GYRO)
+        return skid.motion_track(self.track.time_s, measured, turn, bias_std, self.robot.track_m)
 
 
 def estimate_run(
@@ -147,7 +137,7 @@ def estimate_run(
     settings = FilterSettings(1.0 if tuning == "thesis" else GATE_PROBABILITY, REOPEN_AFTER_S)
     track = run_filter(model, table.time_s, table.columns(model.rows), settings, *samples)
     if name == "skid":
-        track = replace(track, mean=within_bounds(track.mean, driven.track_m))
+        track = replace(track, mean=skid.within_bounds(track.mean, driven.track_m))
         speed_mps = track.state("speed_mps")
     else:
         speed_mps = np.hypot(track.state("speed_x_mps"), track.state("speed_y_mps"))
@@ -177,7 +167,7 @@ def model_of(run: RunLog, robot: Robot, name: str, tuning: str | None = None) ->
             f"filter {name!r} is not for robot {robot.name}, whose drive is {robot.drive}: use {fits}"
         )
     if name == "skid":
-        return make_skid_filter(robot)
+        return skid.make_skid_filter(robot)
     is_thesis = tuning_of(name, tuning) == "thesis"
     has_gnss = not is_thesis and "gnss" in run.streams and len(run.streams["gnss"]) > 0
     return swerve.make_filter(name, robot, has_gnss, is_thesis)
@@ -208,7 +198,7 @@ def enriched(estimate: Estimate) -> RunLog:
         columns[f"std_slip_{wheel}_ratio"] = std
     columns["stale_ratio"] = slip.stale.astype(float)
     if (motion := estimate.motion) is not None:
-        columns["stuck_ratio"] = np.where(motion == Motion.UNKNOWN, np.nan, motion == Motion.STUCK)
+        columns["stuck_ratio"] = np.where(motion == skid.Motion.UNKNOWN, np.nan, motion == skid.Motion.STUCK)
     for sensor, nis in zip(track.sensors, track.nis.T, strict=True):
         columns[f"nis_{sensor}_ratio"] = nis
     return with_tracks(estimate.run, estimate.robot, estimate.name, track.time_s, columns, slip.as_stream())
@@ -264,7 +254,7 @@ class EstimateSummary:
     finite: bool  #: whether all states and covariances are finite
     #: time that the robot was at rest, moving, stuck, and neither is known; None of a filter that does not judge it
     motion: Mapping[str, float] | None
-    stuck: tuple[StuckInterval, ...] | None  #: when it was stuck, None as ``motion``
+    stuck: tuple[skid.StuckInterval, ...] | None  #: when it was stuck, None as ``motion``
 
 
 def summarize(estimate: Estimate) -> EstimateSummary:
@@ -309,8 +299,8 @@ def summarize(estimate: Estimate) -> EstimateSummary:
         n_gated=int((track.use == GATED).sum()),
         dropped=dropped,
         finite=bool(np.isfinite(track.mean).all() and np.isfinite(track.cov).all()),
-        motion=None if motion is None else motion_seconds(track.time_s, motion),
-        stuck=None if motion is None else stuck_intervals(track.time_s, motion),
+        motion=None if motion is None else skid.motion_seconds(track.time_s, motion),
+        stuck=None if motion is None else skid.stuck_intervals(track.time_s, motion),
     )
 
 

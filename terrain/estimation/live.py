@@ -34,15 +34,9 @@ from terrain.estimation import feed
 from terrain.estimation.clocks import NEVER, REWIND_S, SampleQueue, check_channels, readable
 from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, Filter, FilterSettings
 from terrain.estimation.health import HealthMonitor
+from terrain.estimation.models import skid
 from terrain.estimation.models.choice import OBSERVERS, make_observer
 from terrain.estimation.models.observer import Observer, ObserverFeed, ObserverStatus
-from terrain.estimation.models.skid import (
-    Motion,
-    make_skid_filter,
-    motion_at,
-    motion_memory,
-    within_bounds,
-)
 from terrain.estimation.models.swerve import make_filter, scheduled
 from terrain.estimation.wheel_slip import STALE_AFTER_S, WheelSlip
 from terrain.extension import Correction, RegionMonitor, check_corrected
@@ -90,7 +84,8 @@ class LiveEstimate(NamedTuple):
     #: (13,) of the sensors of a swerve robot, as :class:`~terrain.estimation.health.Health`, in the order of
     #: :data:`~terrain.estimation.health.SENSORS`; of others (0,)
     health: Array
-    motion: Motion = Motion.UNKNOWN  #: what is known of the motion of a robot that skids; UNKNOWN of others
+    #: what is known of the motion of a robot that skids; UNKNOWN of others
+    motion: skid.Motion = skid.Motion.UNKNOWN
     stuck_since_s: float = math.nan  #: when the robot became stuck; NaN where it is not
 
 
@@ -385,7 +380,7 @@ class LiveFilter(Live):
             channels = {**CHANNELS, "wheels": robot.rate_channels} if self._skids else CHANNELS
         has_gnss = not self._skids and initial_yaw_rad is not None and "gnss" in channels
         if self._skids:
-            self.model = make_skid_filter(robot)
+            self.model = skid.make_skid_filter(robot)
         else:
             self.model = make_filter(filter_name, robot, with_gnss=has_gnss)
             robot.require("motors", "steering", "sensors")
@@ -403,7 +398,7 @@ class LiveFilter(Live):
         self._feed, self._rows = feed.new_feed(), np.full((1, feed.N_NUMBERS), np.nan)
         self._monitor = None if self._skids else HealthMonitor(robot, self.model)
         self._slip, self._region = WheelSlip(robot, self.states), RegionMonitor(robot)
-        self._motion = motion_memory()
+        self._motion = skid.motion_memory()
         memories = [self.filter.state, self._feed, self._motion]
         memories += [] if self._monitor is None else [self._monitor.memory]
         self._memories = [memory.view(np.uint8) for memory in memories]  # bytes are copied at once
@@ -494,16 +489,16 @@ class LiveFilter(Live):
         if self._monitor is not None:
             self._monitor.judge(time_s, wheels, rates, self._rows, self._feed, filter_.state)
         mean, std = filter_.mean.copy(), np.sqrt(filter_.cov.diagonal())
-        motion, age_s = Motion.UNKNOWN, filter_.reference_age_s
+        motion, age_s = skid.Motion.UNKNOWN, filter_.reference_age_s
         slip_ratio = slip_std = motor_radps = np.full(len(robot.wheels), np.nan)
         wheel_speed_mps = rates
         if self._skids:  # nothing sees the ground go by: slip is not known
-            mean = within_bounds(mean, robot.track_m)
+            mean = skid.within_bounds(mean, robot.track_m)
             left_mps, right_mps = row[feed.SIDE : feed.SIDE + 2].tolist()
             has_gyro = not math.isnan(row[feed.ROWS.index("gyro_z_radps")])
             yaw_rate, bias = (self.states.index(name) for name in ("yaw_rate_radps", "gyro_bias_radps"))
             known = float(mean[yaw_rate]), float(std[bias]), robot.track_m
-            motion = motion_at(time_s, left_mps, right_mps, has_gyro, *known, self._motion)
+            motion = skid.motion_at(time_s, left_mps, right_mps, has_gyro, *known, self._motion)
         else:
             motor_radps = rates
             wheel_speed_mps = robot.wheel_speeds_mps(rates / robot.motors.reduction_ratio)
