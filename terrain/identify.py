@@ -21,11 +21,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from scipy import stats
 from scipy.optimize import least_squares
+from scipy.special import ndtr
 
 from terrain.bootstrap import LEVEL
 from terrain.records import Array
@@ -38,6 +40,7 @@ EDGE = 1e-3  #: In units of the search: a value so near to its bound stands at i
 #: parameter, a search by trust regions would stop anywhere.
 REGULAR = 1e-6
 
+PASSES = 4  #: Of a fit that finds the size of its residuals.
 UNSEEN = 1e-6  #: Part of a parameter in directions of no curvature from which on it is not identified.
 _Candidate = TypeVar("_Candidate")
 
@@ -52,7 +55,7 @@ class Parameter(NamedTuple):
     prior_std: float = math.inf  #: standard deviation of the prior; infinite of none
     step: float = (
         math.nan
-    )  #: size of a usual change, the unit of the search; by default that of the prior, or 1
+    )  #: size of a usual change, the unit of the search; that of the prior by default, or 1
 
     @property
     def unit(self) -> float:
@@ -112,6 +115,7 @@ def identify(
     robust: bool = False,
     starts: Sequence[Array] = (),
     derivative: Callable[[Array], Array] | None = None,
+    scale: tuple[float, float] | None = None,
     **search: Any,
 ) -> Fit:
     r"""Identify parameters.
@@ -125,6 +129,8 @@ def identify(
     starts : values (k,) to begin at, of which the best end counts; the nominal ones by default
     derivative : of the residuals, flat (n, k), by the values; by small differences otherwise, which see nothing where a
         residual goes in steps
+    scale : where the standard deviation is not known: that to begin with, and the least.  Each of :data:`PASSES` takes
+        the median length of the residuals that the one before left
     search : further arguments of :func:`scipy.optimize.least_squares`
 
     Examples
@@ -135,6 +141,14 @@ def identify(
     >>> fit.value.round(6), fit.interval[:, 1].round(6)
     (array([2., 3.]), array([3., 3.]))
     """
+    if scale is not None:
+        size, least = scale
+        for _ in range(PASSES):
+            scaled_by = partial(lambda size, values: residual(values) / size, size)
+            fit = identify(scaled_by, parameters, clusters, robust, starts, derivative, **search)
+            lengths = np.abs(np.hypot.reduce(np.atleast_2d(residual(fit.value).T)))
+            starts, size = [fit.value], max(float(np.median(lengths)), least)
+        return fit
     nominal, low, high, prior_std = (np.array([p[i] for p in parameters]) for i in range(1, 5))
     unit = np.array([p.unit for p in parameters])
     bounds = (low - nominal) / unit, (high - nominal) / unit
@@ -197,15 +211,37 @@ def jackknife_covariance(moved: Array) -> Array:
     return np.asarray((len(moved) - 1) / len(moved) * moved.T @ moved)
 
 
-def half_width(std: Array | float, dof: float, level: float = LEVEL) -> Array:
-    """Return half the interval of a normal number whose standard deviation has ``dof`` degrees of freedom.
+def half_width(std: Array | float, dof: float, level: float = LEVEL, bounded: float = 0.0) -> Array:
+    r"""Return half the interval of a number whose standard deviation has ``dof`` degrees of freedom.
+
+    Beside its normal error it may have one that lies anywhere within ``bounded`` on either side.  Of the sum of both,
+    with the normal one's :math:`\sigma` and :math:`G(z) = z \Phi(z) + \varphi(z)`, the part within h is
+
+    .. math:: \tfrac{\sigma}{b} \big(G(\tfrac{h + b}{\sigma}) - G(\tfrac{h - b}{\sigma})\big) - 1 .
 
     Examples
     --------
     >>> half_width(1.0, 10.0).round(2), half_width(1.0, float("inf")).round(2)
     (np.float64(2.23), np.float64(1.96))
+    >>> [half_width(std, float("inf"), bounded=1.0).round(2).item() for std in (0.0, 0.1, 1.0)]
+    [0.95, 0.98, 2.25]
     """
-    return np.float64(stats.t.ppf((1 + level) / 2, dof)) * np.asarray(std)
+    tail = (1 + level) / 2
+    half = np.float64(stats.t.ppf(tail, dof)) * np.asarray(std)
+    if not bounded > 0.0:
+        return half
+    sigma = np.maximum(half / stats.norm.ppf(tail), 1e-6 * bounded)
+
+    def integral(z: Array) -> Array:
+        return np.asarray(z * ndtr(z) + stats.norm.pdf(z))
+
+    low, high = np.zeros_like(half), half + bounded
+    for _ in range(60):
+        middle = (low + high) / 2
+        apart = integral((middle + bounded) / sigma) - integral((middle - bounded) / sigma)
+        less = sigma / bounded * apart - 1.0 < level
+        low, high = np.where(less, middle, low), np.where(less, high, middle)
+    return np.asarray((low + high) / 2)[()]
 
 
 def std_interval(variance: float, dof: float, level: float = LEVEL) -> tuple[float, float]:

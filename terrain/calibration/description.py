@@ -14,7 +14,14 @@ from terrain.calibration.lag import starts_and_stops, time_constants
 from terrain.calibration.omni import identify_omni
 from terrain.calibration.sensors import MIN_POSITION_S, accelerometer, gyro_bias, sensor_noise, standing
 from terrain.calibration.skid_steer import identify
-from terrain.calibration.wheels import SLIP_RATIO, reduction_ratio, steady_stretches, steering_zeros, why_none
+from terrain.calibration.wheels import (
+    SLIP_RATIO,
+    hard_stretches,
+    reduction_ratio,
+    steady_stretches,
+    steering_zeros,
+    why_none,
+)
 from terrain.errors import DataError
 from terrain.records import RunLog
 from terrain.robots import OmniRobot, Robot, robot_from
@@ -62,36 +69,28 @@ def findings_of(runs: Sequence[RunLog], description: Any, robot: Robot, hard: Se
     elif isinstance(robot, OmniRobot):
         findings = identify_omni(runs, robot)
     else:
-        findings = find(runs, description, robot, hard)
-    return [_beside(finding, description) for finding in findings]
-
-
-def _beside(finding: Finding, description: Any) -> Finding:
-    """Return a finding with its unit, and the number that a description has of it."""
-    section, _, name = finding.parameter.partition(".")
-    entry = description.get(section, {}).get(name)
-    if entry:
-        return finding._replace(unit=entry["unit"], described=float(entry["value"]))
-    return finding._replace(unit=name.rpartition("_")[2] if section == IDENTIFIED else "s")
-
-
-def find(runs: Sequence[RunLog], description: Any, robot: Robot, hard: Sequence[str]) -> list[Finding]:
-    """Return a finding for each number that logs can determine, with the reason where these do not."""
-    resting = [stretch for run in runs for stretch in standing(run, robot)]
-    held = [stretch for run in runs for stretch in standing(run, robot, MIN_POSITION_S)]
-    findings = [*gyro_bias(resting, robot), *accelerometer(held, robot), *sensor_noise(resting, robot)]
-    steady = [stretch for run in runs for stretch in steady_stretches(run, robot, hard)]
-    driven = [*steering_zeros(steady, robot), reduction_ratio(steady, robot)]
-    findings += (
-        driven if steady else [finding._replace(note=why_none(runs, robot, hard)) for finding in driven]
-    )
-    # Starts are distinguished from turns by the steering angles, with the zeros that have just been found.
-    better = robot_from(robot.name, described_with(description, findings))
-    events = [event for run in runs for event in starts_and_stops(run, better, hard)]
-    lags = time_constants(events)
-    return findings + (
-        lags if events else [finding._replace(note=why_none(runs, robot, hard)) for finding in lags]
-    )
+        resting = [stretch for run in runs for stretch in standing(run, robot)]
+        held = [stretch for run in runs for stretch in standing(run, robot, MIN_POSITION_S)]
+        findings = [*gyro_bias(resting, robot), *accelerometer(held, robot), *sensor_noise(resting, robot)]
+        stretches, why = (
+            [each for run in runs for each in hard_stretches(run, hard)],
+            why_none(runs, robot, hard),
+        )
+        steady = [each for stretch in stretches for each in steady_stretches(stretch, robot)]
+        driven = [*steering_zeros(steady, robot), reduction_ratio(steady, robot)]
+        findings += driven if steady else [finding._replace(note=why) for finding in driven]
+        # Starts are distinguished from turns by the steering angles, with the zeros that have just been found.
+        better = robot_from(robot.name, described_with(description, findings))
+        events = [each for stretch in stretches for each in starts_and_stops(stretch, better)]
+        lags = time_constants(events)
+        findings += lags if events else [finding._replace(note=why) for finding in lags]
+    for i, finding in enumerate(findings):
+        section, _, name = finding.parameter.partition(".")
+        if entry := description.get(section, {}).get(name):
+            findings[i] = finding._replace(unit=entry["unit"], described=float(entry["value"]))
+        else:
+            findings[i] = finding._replace(unit=name.rpartition("_")[2] if section == IDENTIFIED else "s")
+    return findings
 
 
 def described_with(description: Any, findings: Sequence[Finding]) -> Any:
@@ -118,15 +117,17 @@ def described_with(description: Any, findings: Sequence[Finding]) -> Any:
 
 def description_yaml(description: Any) -> str:
     """Return a description as YAML with one number a line."""
+
+    def flow(entry: Any) -> str:
+        text = yaml.safe_dump(
+            entry, default_flow_style=True, sort_keys=False, allow_unicode=True, width=math.inf
+        )
+        return str(text).removesuffix("...\n").strip()
+
     lines = []
     for key, entry in description.items():
         section = isinstance(entry, dict) and "value" not in entry
-        lines += [f"{key}:"] if section else [f"{key}: {_flow(entry)}"]
+        lines += [f"{key}:"] if section else [f"{key}: {flow(entry)}"]
         if section:
-            lines += [f"  {name}: {_flow(number)}" for name, number in entry.items()]
+            lines += [f"  {name}: {flow(number)}" for name, number in entry.items()]
     return "\n".join(lines) + "\n"
-
-
-def _flow(entry: Any) -> str:
-    text = yaml.safe_dump(entry, default_flow_style=True, sort_keys=False, allow_unicode=True, width=math.inf)
-    return str(text).removesuffix("...\n").strip()

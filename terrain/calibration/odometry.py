@@ -84,27 +84,59 @@ def odometry_rows(run: RunLog, robot: TrackedRobot) -> tuple[Array, Array]:
     return rows_of(run, robot, ODOMETRY_ROWS)[:2]
 
 
-def legs_of_windows(
-    run: RunLog, number: int, windows: Sequence[WindowPoses], robot: TrackedRobot, delay_s: float
-) -> tuple[list[Leg], Leg | None]:
-    """Return the legs of a command's windows, and that of all of them in a row; None where they have gaps.
+def legs_over(
+    run: RunLog, number: int, robot: TrackedRobot, spans: Sequence[tuple[float, float, Array]], delay_s: float
+) -> list[Leg | None]:
+    """Return the leg from each start to each end with the change of pose; None where tracks or gyro have gaps.
 
     Poses are of an earlier time than their stamps by the delay behind gyro and tracks; before its first sample a run is
     taken to have driven as at that.
     """
-    found = (
-        _leg(run, number, window.pose[-1], (window.time_s[0], window.time_s[-1]), robot, delay_s)
-        for window in windows
+    if not spans:
+        return []
+    time_s, rows = odometry_rows(run, robot)
+    known, found = np.isfinite(rows), list[Leg | None]()
+    if not known[:, 2].any():
+        raise DataError(f"run {run.run_id!r} has no gyro_z_radps, which odometry with slip needs")
+    for start_s, end_s, moved in spans:
+        from_s, to_s, n = start_s - delay_s, end_s - delay_s, max(math.ceil((end_s - start_s) / STEP_S), 1)
+        if any(_has_gap(time_s[known[:, column]], from_s, to_s) for column in (0, 1, 2)):
+            found.append(None)
+            continue
+        step_s = (end_s - start_s) / n
+        at_s = from_s + (np.arange(n) + 0.5) * step_s
+        left, right, rate, *tilt = (
+            np.interp(at_s, time_s[known[:, k]], rows[known[:, k], k]) if known[:, k].any() else np.zeros(n)
+            for k in range(5)
+        )
+        speeds, tilts = np.column_stack([left, right]), np.column_stack(tilt)
+        found.append(Leg(number, moved, step_s, speeds, rate, tilts, end_s - start_s))
+    return found
+
+
+def _has_gap(time_s: Array, from_s: float, to_s: float) -> bool:
+    """Return whether samples leave a gap between two times; a run may begin a delay after the first."""
+    inside = time_s[(time_s > from_s - GAP_S) & (time_s < to_s + GAP_S)]
+    if len(inside) < 2:
+        return True
+    return bool(
+        np.diff(inside).max() > GAP_S or inside[-1] < to_s - GAP_S or inside[0] > from_s + MAX_WINDOW_GAP_S
     )
-    single = [leg for leg in found if leg is not None]
-    origins = window_origins(run, windows)
-    if len(origins) < 2:
-        return single, None
-    moved, ends_s = (
-        composed(origins[-1], windows[-1].pose[-1]),
-        (windows[0].time_s[0], windows[-1].time_s[-1]),
+
+
+def legs_of_windows(
+    run: RunLog, number: int, windows: Sequence[WindowPoses], robot: TrackedRobot, delay_s: float
+) -> tuple[list[Leg], list[Leg]]:
+    """Return the legs of a command's windows, and that of all of them in a row; none where they have gaps."""
+    spans, origins = (
+        [(each.time_s[0], each.time_s[-1], each.pose[-1]) for each in windows],
+        window_origins(run, windows),
     )
-    return single, _leg(run, number, moved, ends_s, robot, delay_s)
+    if len(origins) > 1:
+        spans.append((spans[0][0], spans[-1][1], composed(origins[-1], windows[-1].pose[-1])))
+    legs = legs_over(run, number, robot, spans, delay_s)
+    single, whole = legs[: len(windows)], legs[len(windows) :]
+    return [leg for leg in single if leg is not None], [leg for leg in whole if leg is not None]
 
 
 def window_origins(run: RunLog, windows: Sequence[WindowPoses]) -> list[Array]:
@@ -127,31 +159,27 @@ def window_origins(run: RunLog, windows: Sequence[WindowPoses]) -> list[Array]:
     return origins
 
 
-def legs_of_poses(
-    run: RunLog, number: int, robot: TrackedRobot, length_s: float, delay_s: float = 0.0
-) -> list[Leg]:
-    """Return legs of a run with poses in one frame, one after the other.
-
-    The delay is that of the poses behind the gyro and the tracks.
-    """
-    pose = run.streams["pose"]
-    values = pose.values.copy()
-    values[:, 2] = unwrapped(values[:, 2])
+def legs_of_poses(run: RunLog, number: int, robot: TrackedRobot, length_s: float) -> list[Leg]:
+    """Return legs of a run with poses in one frame, one after the other."""
+    pose, spans = run.streams["pose"], []
+    values = np.column_stack([pose.values[:, :2], unwrapped(pose.values[:, 2])])
     known = np.isfinite(values).all(axis=1)
     time_s, values = pose.time_s[known], values[known]
-    legs: list[Leg] = []
     if not len(time_s):
-        return legs
+        return []
     for begin_s in np.arange(time_s[0], time_s[-1] - length_s + 1e-9, length_s):
         first, last = np.searchsorted(time_s, [begin_s - 1e-9, begin_s + length_s - 1e-9]).tolist()
         last = min(last, len(time_s) - 1)
         late_s = max(time_s[first] - begin_s, abs(time_s[last] - begin_s - length_s))
-        if late_s > GAP_S:  # no pose there
-            continue
-        moved = relative(values[first], values[last])
-        leg = _leg(run, number, moved, (time_s[first], time_s[last]), robot, delay_s)
-        legs += [leg] if leg is not None else []
-    return legs
+        if late_s <= GAP_S:  # else no pose there
+            (x, y, turn), cos, sin = values[last] - values[first], *_direction(values[first, 2])
+            moved = np.array([cos * x + sin * y, cos * y - sin * x, turn])
+            spans.append((time_s[first], time_s[last], moved))
+    return [leg for leg in legs_over(run, number, robot, spans, 0.0) if leg is not None]
+
+
+def _direction(angle_rad: float) -> tuple[float, float]:
+    return float(np.cos(angle_rad)), float(np.sin(angle_rad))
 
 
 def composed(first: Array, then: Array) -> Array:
@@ -162,57 +190,9 @@ def composed(first: Array, then: Array) -> Array:
     >>> composed(np.array([1.0, 0.0, np.pi / 2]), np.array([1.0, 0.0, 0.0])).round(6).tolist()
     [1.0, 1.0, 1.570796]
     """
-    cos, sin = np.cos(first[2]), np.sin(first[2])
+    cos, sin = _direction(first[2])
     x, y = cos * then[0] - sin * then[1], sin * then[0] + cos * then[1]
     return np.array([first[0] + x, first[1] + y, first[2] + then[2]])
-
-
-def relative(first: Array, last: Array) -> Array:
-    """Return a pose (3,) in the frame of another.
-
-    Examples
-    --------
-    >>> start, change = np.array([1.0, 2.0, 0.3]), np.array([0.5, -0.2, 0.1])
-    >>> relative(start, composed(start, change)).round(6).tolist()
-    [0.5, -0.2, 0.1]
-    """
-    cos, sin = np.cos(first[2]), np.sin(first[2])
-    x, y = last[0] - first[0], last[1] - first[1]
-    return np.array([cos * x + sin * y, cos * y - sin * x, last[2] - first[2]])
-
-
-def _leg(
-    run: RunLog, number: int, moved: Array, ends_s: tuple[float, float], robot: TrackedRobot, delay_s: float
-) -> Leg | None:
-    """Return a leg; None where tracks or gyro were not measured in a part of it."""
-    time_s, rows = odometry_rows(run, robot)
-    if not np.isfinite(rows[:, 2]).any():
-        raise DataError(f"run {run.run_id!r} has no gyro_z_radps, which odometry with slip needs")
-    for column in (0, 1, 2):
-        if _has_gap(time_s[np.isfinite(rows[:, column])], ends_s[0] - delay_s, ends_s[1] - delay_s):
-            return None
-    length_s = ends_s[1] - ends_s[0]
-    n = max(int(np.ceil(length_s / STEP_S)), 1)
-    step_s = length_s / n
-    at_s = ends_s[0] - delay_s + (np.arange(n) + 0.5) * step_s
-    known = np.isfinite(rows)
-    left, right, rate, roll, pitch = (
-        np.interp(at_s, time_s[known[:, k]], rows[known[:, k], k]) if known[:, k].any() else np.zeros(n)
-        for k in range(5)
-    )
-    return Leg(
-        number, moved, step_s, np.column_stack([left, right]), rate, np.column_stack([roll, pitch]), length_s
-    )
-
-
-def _has_gap(time_s: Array, from_s: float, to_s: float) -> bool:
-    """Return whether samples leave a gap between two times; a run may begin a delay after the first."""
-    inside = time_s[(time_s > from_s - GAP_S) & (time_s < to_s + GAP_S)]
-    if len(inside) < 2:
-        return True
-    return bool(
-        np.diff(inside).max() > GAP_S or inside[-1] < to_s - GAP_S or inside[0] > from_s + MAX_WINDOW_GAP_S
-    )
 
 
 #: What is known of a mount before: on the robot, and mounted straight within 6 degrees.
@@ -223,8 +203,7 @@ MOUNT = (
 )
 LOWEST = {EXPONENT: 0.0, TRACK_RATIO: 0.05}  #: Bounds of parameters of the slip model.
 SCALE_STD_RATIO = 0.1  #: Of the sprocket's radius beside the described one.
-#: Error of a leg of 2 s that a fit begins with, and the least; each pass takes what the one before left.
-FIRST_ERROR_M, LEAST_ERROR_M, PASSES = 0.1, 1e-4, 4
+FIRST_ERROR_M, LEAST_ERROR_M = 0.1, 1e-4  #: Of a leg of 2 s: what a fit begins with, and the least.
 MIN_LEGS = 10
 
 FLAT_RAD = 0.02  #: Root mean square tilt, a degree, below which the ground counts as level.
@@ -245,8 +224,7 @@ SLIP = Kind("slip-compensated", tuple(k for k in range(N_MODEL) if k != TRACK_RA
 KINDS = (ENCODER, GYRODOMETRY, ENDO, SLIP)  #: Encoder odometry has the best single effective track.
 
 
-@dataclass(frozen=True, eq=False)
-class FittedOdometry:
+class FittedOdometry(NamedTuple):
     """A kind of odometry fitted to legs."""
 
     kind: Kind  #: which
@@ -275,27 +253,18 @@ def fit_odometry(kind: Kind, legs: Sequence[Leg], robot: TrackedRobot) -> Fitted
         Parameter(PARAMETERS[k], float(vector[k]), LOWEST.get(k, -math.inf), math.inf, float(std[k]))
         for k in free
     ]
-    packed, measured = _packed(legs), np.array([leg.moved[:2] for leg in legs])
+    ends, measured = _predictor(kind, legs, robot), np.array([leg.moved[:2] for leg in legs])
     longer = np.array([max(leg.length_s / 2.0, 1.0) for leg in legs])
     runs, number = np.unique([leg.run for leg in legs], return_inverse=True)
 
     def errors_m(values: Array) -> Array:
         vector[free] = values[: -len(MOUNT)]
-        ends = _ends(packed, vector, values[-len(MOUNT) :], robot, kind.by_gyro)
-        return np.asarray((ends[:, :2] - measured) / longer[:, None])
+        return np.asarray((ends(vector, values[-len(MOUNT) :])[:, :2] - measured) / longer[:, None])
 
-    error_m, starts = FIRST_ERROR_M, list[Array]()
-    for _ in range(PASSES):
-
-        def residual(values: Array, error_m: float = error_m) -> Array:
-            return errors_m(values) / error_m
-
-        fit = identify(residual, [*parameters, *MOUNT], number, True, starts)
-        starts, distance_m = [fit.value], np.hypot(*errors_m(fit.value).T)
-        error_m = max(float(np.median(distance_m)), LEAST_ERROR_M)
+    fit = identify(errors_m, [*parameters, *MOUNT], number, True, scale=(FIRST_ERROR_M, LEAST_ERROR_M))
+    left_m = np.hypot(*errors_m(fit.value).T) * longer
     covariance = np.zeros((N_MODEL, N_MODEL))
     covariance[np.ix_(free, free)] = fit.cov[: len(free), : len(free)]
-    left_m = distance_m * longer
     path_m = np.array([np.abs(leg.speeds_mps.mean(axis=1)).sum() * leg.step_s for leg in legs])
     ratio = float(np.sqrt((left_m**2).mean() / max((path_m**2).mean(), 1e-12)))
     model = model_of(
@@ -306,11 +275,6 @@ def fit_odometry(kind: Kind, legs: Sequence[Leg], robot: TrackedRobot) -> Fitted
         found=f"{len(runs)} runs, {len(legs)} legs",
     )
     return FittedOdometry(kind, model, fit)
-
-
-def predict_ends(fitted: FittedOdometry, legs: Sequence[Leg], robot: TrackedRobot) -> Array:
-    """Return the change of pose (n, 3) of the observed point over each leg."""
-    return _ends(_packed(legs), fitted.model.vector, fitted.mount, robot, fitted.kind.by_gyro)
 
 
 def without_tilt(legs: Sequence[Leg]) -> bool:
@@ -325,31 +289,18 @@ def level(kind: Kind) -> Kind:
     return kind._replace(free=tuple(place for place in kind.free if place not in tilt))
 
 
-class _Packed(NamedTuple):
-    """All legs in a row: samples, where each leg ends, and its step."""
+def _predictor(kind: Kind, legs: Sequence[Leg], robot: TrackedRobot) -> Callable[[Array, Array], Array]:
+    """Return what gives the end (n, 3) of each leg by the numbers of a slip model and a mount."""
+    each = ("speeds_mps", "yaw_rate_radps", "tilt_rad")
+    samples = tuple(np.concatenate([getattr(leg, name) for leg in legs]) for name in each)
+    end, step_s = np.cumsum([len(leg.yaw_rate_radps) for leg in legs]), np.array([leg.step_s for leg in legs])
+    geometry, theta = np.array([robot.half_track_m, robot.contact_length_m]), np.zeros(N_PARAMETERS)
 
-    speeds: Array
-    rate: Array
-    tilt: Array
-    end: Array
-    step_s: Array
+    def ends(vector: Array, mount: Array) -> Array:
+        theta[:N_MODEL] = vector
+        return np.asarray(_sum_legs(theta, mount, geometry, kind.by_gyro, *samples, end, step_s))
 
-
-def _packed(legs: Sequence[Leg]) -> _Packed:
-    return _Packed(
-        np.concatenate([leg.speeds_mps for leg in legs]),
-        np.concatenate([leg.yaw_rate_radps for leg in legs]),
-        np.concatenate([leg.tilt_rad for leg in legs]),
-        np.cumsum([len(leg.yaw_rate_radps) for leg in legs]),
-        np.array([leg.step_s for leg in legs]),
-    )
-
-
-def _ends(packed: _Packed, vector: Array, mount: Array, robot: TrackedRobot, by_gyro: bool) -> Array:
-    theta = np.zeros(N_PARAMETERS)
-    theta[:N_MODEL] = vector
-    geometry = np.array([robot.half_track_m, robot.contact_length_m])
-    return np.asarray(_sum_legs(theta, mount, geometry, by_gyro, packed))
+    return ends
 
 
 @njit
@@ -358,10 +309,13 @@ def _sum_legs(
     mount: Array,
     geometry: Array,
     by_gyro: bool,
-    packed: _Packed,
+    speeds: Array,
+    rate: Array,
+    tilt: Array,
+    end: Array,
+    step_s: Array,
 ) -> Array:
     """Return the change of pose (legs, 3) of the observed point; ``geometry`` is d and the length."""
-    speeds, rate, tilt, end, step_s = packed
     half_track_m, length_m = geometry
     out, first = np.empty((len(end), 3)), 0
     by_track = 2.0 * half_track_m * theta[TRACK_RATIO]
@@ -440,7 +394,8 @@ def held_out_ends(
     ends = {kind.name: np.full((len(every), 3), np.nan) for kind in kinds}
     for done, ((train, test), kind) in enumerate(itertools.product(folds(fold), kinds), start=1):
         fitted = fit_odometry(kind, [every[k] for k in train], robot)
-        ends[kind.name][test] = predict_ends(fitted, [every[k] for k in test], robot)
+        tested = _predictor(kind, [every[k] for k in test], robot)
+        ends[kind.name][test] = tested(fitted.model.vector, fitted.mount)
         progress(done, n_folds * len(kinds))
     edges = np.cumsum([len(legs) for legs in groups.values()])[:-1]
     return {name: dict(zip(groups, np.split(end, edges), strict=True)) for name, end in ends.items()}
@@ -483,56 +438,6 @@ def score_legs(legs: Sequence[Leg], ends: Mapping[str, Array], seed: int) -> Leg
 SETTINGS = TrackedSettings(
     observation_gain_ps=(2.0, 2.0, 2.0), normalised=True, position_std_m=0.03, yaw_std_rad=0.04
 )
-
-
-def efficiencies_before(
-    run: RunLog, windows: Sequence[WindowPoses], robot: TrackedRobot, delay_s: float, mount: Array
-) -> Array | None:
-    """Return the efficiencies (2,) of the left and the right track before a command's last window.
-
-    None where there are fewer than two windows, gaps that are too long, or too few fixes.
-    """
-    origins = window_origins(run, windows)
-    if len(origins) < 2:
-        return None
-    time_s, own = odometry_rows(run, robot)
-    rows = np.full((len(time_s), len(ROWS)), np.nan)
-    rows[:, :2], rows[:, 5] = own[:, :2], own[:, 2]
-    for origin, window in zip(origins[:-1], windows, strict=False):
-        for stamp_s, pose in zip(window.time_s - delay_s, window.pose, strict=True):
-            tick = int(np.argmin(np.abs(time_s - stamp_s)))
-            if abs(time_s[tick] - stamp_s) < 0.5 * (time_s[1] - time_s[0]) + 1e-9:
-                rows[tick, 2:5] = of_body(composed(origin, pose), mount)
-    until = int(np.searchsorted(time_s, windows[-2].time_s[-1] - delay_s, side="right"))
-    if until < 2:
-        return None
-    track = observe(TrackedObserver(robot, SETTINGS), time_s[:until], rows[:until])
-    if track.status[-1] == ObserverStatus.STARTING:
-        return None
-    return np.array([track.state(f"eta_{side}_ratio")[-1] for side in ("left", "right")])
-
-
-def of_body(pose: Array, mount: Array) -> Array:
-    """Return the pose (3,) of the body where that of the observed point is measured, both from 0."""
-    lever = complex(mount[0], mount[1])
-    seen = complex(pose[0], pose[1]) * np.exp(1j * mount[2])
-    body = seen + lever - lever * np.exp(1j * pose[2])
-    return np.array([body.real, body.imag, pose[2]])
-
-
-def end_by_efficiencies(leg: Leg, eta: Array, mount: Array, robot: TrackedRobot) -> Array:
-    """Return the change of pose (3,) of the observed point over a leg with efficiencies (2,): Tazzari (5).
-
-    Examples
-    --------
-    >>> from terrain.robots import load_robot
-    >>> speeds, still = np.full((20, 2), 0.5), np.zeros(20)
-    >>> leg = Leg(0, np.zeros(3), 0.1, speeds, still, np.zeros((20, 2)), 2.0)
-    >>> end_by_efficiencies(leg, np.array([0.9, 0.9]), np.zeros(3), load_robot("marmotte")).round(3).tolist()
-    [0.9, 0.0, 0.0]
-    """
-    slipping = leg._replace(speeds_mps=leg.speeds_mps * eta)
-    return np.asarray(_ends(_packed([slipping]), SlipModel().vector, mount, robot, by_gyro=False)[0])
 
 
 #: A command's leg that is so much shorter than the longest of all is left out: its windows are not whole.
@@ -579,12 +484,26 @@ def judge_odometry(
     Runs have poses, compared after some lengths, or are commands of DRIVE with the poses of their windows by run.
     ``DataError`` if fewer runs than folds have poses.
     """
-    delay_s = robot.identified.get("lidar_delay_s", 0.0) if windows else 0.0
-    groups = (
-        _window_groups(runs, windows, robot, delay_s)
-        if windows
-        else {f"{length:g} s": _pose_legs(runs, robot, length) for length in lengths_s}
-    )
+    delay_s, groups = 0.0, dict[str, list[Leg]]()
+    if windows:
+        delay_s = robot.identified.get("lidar_delay_s", 0.0)
+        both = [
+            legs_of_windows(run, number, windows.get(run.run_id, ()), robot, delay_s)
+            for number, run in enumerate(runs)
+        ]
+        single, chained = (list(itertools.chain.from_iterable(part)) for part in zip(*both, strict=True))
+        longest_s = max((leg.length_s for leg in chained), default=0.0)
+        groups = {
+            "window": single,
+            "command": [leg for leg in chained if leg.length_s > SHORT_RATIO * longest_s],
+        }
+    for length_s in () if windows else lengths_s:
+        groups[f"{length_s:g} s"] = [
+            leg
+            for number, run in enumerate(runs)
+            if "pose" in run.streams
+            for leg in legs_of_poses(run, number, robot, length_s)
+        ]
     groups = {name: legs for name, legs in groups.items() if legs}
     if not groups:
         raise DataError(
@@ -596,63 +515,55 @@ def judge_odometry(
         score_legs(legs, {kind: by[name] for kind, by in ends.items()}, seed) for name, legs in groups.items()
     )
     every = [leg for legs in groups.values() for leg in legs]
-    n_runs = len({leg.run for leg in every})
     flat = without_tilt(every)
     fitted = fit_odometry(level(SLIP) if flat else SLIP, every, robot)
     adaptive = None
     if windows:
-        adaptive = _adaptive(runs, windows, groups, ends, robot, delay_s, fitted.mount, seed)
+        single = groups["window"]
+        last, chosen, predicted = {leg.run: k for k, leg in enumerate(single)}, [], []
+        for number, run in enumerate(runs):
+            eta = efficiencies_before(run, windows.get(run.run_id, ()), robot, delay_s, fitted.mount)
+            if eta is not None and number in last:
+                leg = single[last[number]]
+                slipping = leg._replace(speeds_mps=leg.speeds_mps * eta)  # Tazzari (5)
+                chosen.append(last[number])
+                predicted.append(_predictor(ENCODER, [slipping], robot)(SlipModel().vector, fitted.mount)[0])
+        if len(chosen) > 1:
+            compared = {kind.name: ends[kind.name]["window"][chosen] for kind in (ENCODER, GYRODOMETRY)}
+            compared[ADAPTIVE] = np.array(predicted)
+            adaptive = score_legs([single[k] for k in chosen], compared, seed)
     x_m, y_m, angle_rad = map(float, fitted.mount)
     rows = zip(fitted.fit.parameters, fitted.fit.value.tolist(), *fitted.fit.interval.tolist(), strict=True)
     found = {p.name: ParameterFound(*row) for p, *row in rows if p.name in PARAMETERS}
+    n_runs = len({leg.run for leg in every})
     return JudgedOdometry(n_runs, scores, fitted.model, found, (x_m, y_m), angle_rad, adaptive, delay_s, flat)
 
 
-def _window_groups(
-    runs: Sequence[RunLog],
-    windows: Mapping[str, tuple[WindowPoses, ...]],
-    robot: TrackedRobot,
-    delay_s: float,
-) -> dict[str, list[Leg]]:
-    single: list[Leg] = []
-    chained: list[Leg] = []
-    for number, run in enumerate(runs):
-        own, whole = legs_of_windows(run, number, windows.get(run.run_id, ()), robot, delay_s)
-        single += own
-        chained += [whole] if whole is not None else []
-    longest_s = max((leg.length_s for leg in chained), default=0.0)
-    return {"window": single, "command": [leg for leg in chained if leg.length_s > SHORT_RATIO * longest_s]}
+def efficiencies_before(
+    run: RunLog, windows: Sequence[WindowPoses], robot: TrackedRobot, delay_s: float, mount: Array
+) -> Array | None:
+    """Return the efficiencies (2,) of the left and the right track before a command's last window.
 
-
-def _pose_legs(runs: Sequence[RunLog], robot: TrackedRobot, length_s: float) -> list[Leg]:
-    return [
-        leg
-        for number, run in enumerate(runs)
-        if "pose" in run.streams
-        for leg in legs_of_poses(run, number, robot, length_s)
-    ]
-
-
-def _adaptive(
-    runs: Sequence[RunLog],
-    windows: Mapping[str, tuple[WindowPoses, ...]],
-    groups: Mapping[str, Sequence[Leg]],
-    ends: Mapping[str, Mapping[str, Array]],
-    robot: TrackedRobot,
-    delay_s: float,
-    mount: Array,
-    seed: int,
-) -> LegScores | None:
-    """Return the scores over the last windows of commands."""
-    single = groups["window"]
-    last_of = {leg.run: k for k, leg in enumerate(single)}
-    chosen, predicted = [], []
-    for number, run in enumerate(runs):
-        eta = efficiencies_before(run, windows.get(run.run_id, ()), robot, delay_s, mount)
-        if eta is not None and number in last_of:
-            chosen.append(last_of[number])
-            predicted.append(end_by_efficiencies(single[last_of[number]], eta, mount, robot))
-    if len(chosen) < 2:
+    None where there are fewer than two windows, gaps that are too long, or too few fixes.
+    """
+    origins = window_origins(run, windows)
+    if len(origins) < 2:
         return None
-    compared = {kind.name: ends[kind.name]["window"][chosen] for kind in (ENCODER, GYRODOMETRY)}
-    return score_legs([single[k] for k in chosen], compared | {ADAPTIVE: np.array(predicted)}, seed)
+    time_s, own = odometry_rows(run, robot)
+    rows = np.full((len(time_s), len(ROWS)), np.nan)
+    rows[:, :2], rows[:, 5] = own[:, :2], own[:, 2]
+    lever, turned = complex(mount[0], mount[1]), np.exp(1j * mount[2])
+    for origin, window in zip(origins[:-1], windows, strict=False):
+        for stamp_s, pose in zip(window.time_s - delay_s, window.pose, strict=True):
+            tick = int(np.argmin(np.abs(time_s - stamp_s)))
+            if abs(time_s[tick] - stamp_s) < 0.5 * (time_s[1] - time_s[0]) + 1e-9:
+                x, y, yaw = composed(origin, pose)
+                body = complex(x, y) * turned + lever - lever * np.exp(1j * yaw)
+                rows[tick, 2:5] = body.real, body.imag, yaw
+    until = int(np.searchsorted(time_s, windows[-2].time_s[-1] - delay_s, side="right"))
+    if until < 2:
+        return None
+    observed = observe(TrackedObserver(robot, SETTINGS), time_s[:until], rows[:until])
+    if observed.status[-1] == ObserverStatus.STARTING:
+        return None
+    return np.array([observed.state(f"eta_{side}_ratio")[-1] for side in ("left", "right")])

@@ -23,18 +23,16 @@ shows it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 
 from terrain.calibration.finding import Finding, around, undetermined
-from terrain.errors import DataError
 from terrain.identify import half_width
-from terrain.records import Array, RunLog
+from terrain.records import RunLog
 from terrain.robots import OmniRobot
-from terrain.slip_learning.measured import MeasuredSlip, estimate_delay, measured_slip, outside_source
-from terrain.slip_learning.rollers import MIN_RUNS, RollerFindings, distance_bound, roller_findings
+from terrain.slip_learning.measured import STRIDE_S, WINDOW_S, measure, outside_source
+from terrain.slip_learning.rollers import MIN_RUNS, distances_of, roller_findings
 
 FRICTION = "motors.friction_nm"
 COM_X, COM_Y = "body.com_x_m", "body.com_y_m"
@@ -55,20 +53,11 @@ def identify_omni(runs: Sequence[RunLog], robot: OmniRobot, seed: int = 0) -> li
     They are of motors alone, driving runs under a camera, or both; runs of a session (with weights, say) are not those
     of the robot as described, and are left out.
     """
-    measured = [run for run in runs if outside_source(run) is not None]
-    own = [run for run in measured if not run.session and len(run.terrains) == 1]
     alone = [run for run in runs if outside_source(run) is None and not run.terrains]
+    own = [
+        run for run in runs if outside_source(run) is not None and not run.session and len(run.terrains) == 1
+    ]
     return [motor_friction(alone, robot), *_driven(own, robot, seed)]
-
-
-class MotorFriction(NamedTuple):
-    """No-load current of one motor in one run, extrapolated to rest, and its growth per rad/s."""
-
-    motor: str
-    run_id: str
-    current_a: float
-    slope_a_per_radps: float
-    n: int
 
 
 def motor_friction(runs: Sequence[RunLog], robot: OmniRobot) -> Finding:
@@ -76,153 +65,98 @@ def motor_friction(runs: Sequence[RunLog], robot: OmniRobot) -> Finding:
 
     The interval is that of the mean over motors: another motor of the kind may differ by more than that.
     """
-    fits = [fit for run in runs for fit in no_load_currents(run, robot)]
-    by_motor = {
-        wheel: np.array([(f.current_a, f.slope_a_per_radps) for f in fits if f.motor == wheel])
-        for wheel in robot.wheels
-    }
-    if not fits or not all(map(len, by_motor.values())):
+    fits = {run.run_id: lines for run in runs if (lines := no_load_lines(run, robot))}
+    if not fits:
         return undetermined(
             [FRICTION], "no run of motors alone: none without a pose whose motors all turn at several speeds"
         )[0]
-    nm_per_a = robot.motors.nm_per_a
-    means = np.array([each.mean(axis=0) for each in by_motor.values()])
-    mean_a, slope = means.mean(axis=0)
+    means = np.mean([[line[:2] for line in lines] for lines in fits.values()], axis=0)
+    n = sum(line[2] for lines in fits.values() for line in lines)
+    (mean_a, slope), nm_per_a = means.mean(axis=0), robot.motors.nm_per_a
     half = float(half_width(means[:, 0].std(ddof=1) / math.sqrt(len(means)), len(means) - 1))
     each = ", ".join(f"{a:.3f}" for a in means[:, 0])
-    return around(
-        FRICTION,
-        mean_a * nm_per_a,
-        half * nm_per_a,
-        sum(fit.n for fit in fits),
-        "stretches",
-        tuple(dict.fromkeys(fit.run_id for fit in fits)),
+    note = (
         f"no-load currents of {each} A, and {1000 * slope:.2f} mA more per rad/s of the motor, which the "
-        "description leaves out; torque constant and efficiency as described",
+        "description leaves out; torque constant and efficiency as described"
     )
+    return around(FRICTION, mean_a * nm_per_a, half * nm_per_a, n, "stretches", fits, note)
 
 
-def no_load_currents(run: RunLog, robot: OmniRobot) -> list[MotorFriction]:
-    """Return the no-load current of each motor in a run; none where it is no run of motors alone."""
-    wheels = run.streams.get("wheels")
-    names = [(wheel, f"motor_{wheel}_radps", f"current_{wheel}_a") for wheel in robot.wheels]
-    if wheels is None or any(not {rate, amps} <= set(wheels.channels) for _, rate, amps in names):
+def no_load_lines(run: RunLog, robot: OmniRobot) -> list[tuple[float, float, int]]:
+    """Return the current of each motor extrapolated to rest, its growth per rad/s, and the stretches behind them.
+
+    None where it is no run of motors alone; stretches are blocks at steady speed, by magnitude.
+    """
+    wheels, lines = run.streams.get("wheels"), []
+    names = [(f"motor_{wheel}_radps", f"current_{wheel}_a") for wheel in robot.wheels]
+    if wheels is None or any(not set(pair) <= set(wheels.channels) for pair in names):
         return []
-    fits = []
-    for wheel, rate, amps in names:
-        speed, current = _steady_blocks(wheels.time_s, wheels.channel(rate), wheels.channel(amps), robot)
-        if len(speed) < MIN_BLOCKS or speed.max() < MIN_SPEED_RATIO * speed.min():
+    block = np.floor((wheels.time_s - wheels.time_s[0]) / BLOCK_S).astype(np.int64)
+    for pair in names:
+        rate, current = (wheels.channel(name) for name in pair)
+        known, steady = np.isfinite(rate) & np.isfinite(current), []
+        for number in np.unique(block[known]):
+            rows = known & (block == number)
+            mean = float(np.abs(rate[rows].mean()))
+            fast = mean >= MIN_RATE_RADPS * robot.motors.reduction_ratio
+            if fast and rate[rows].std() <= MAX_SPREAD_RATIO * mean:
+                steady.append((mean, float(np.abs(current[rows]).mean())))
+        if len(steady) < MIN_BLOCKS:
             return []
-        intercept_a, slope = np.polynomial.Polynomial.fit(speed, current, 1).convert().coef.tolist()
-        if intercept_a <= 0.0 or slope < 0.0:
+        speed, current = np.array(steady).T
+        rest_a, slope = np.polynomial.Polynomial.fit(speed, current, 1).convert().coef.tolist()
+        if speed.max() < MIN_SPEED_RATIO * speed.min() or rest_a <= 0.0 or slope < 0.0:
             return []
-        fits.append(MotorFriction(wheel, run.run_id, intercept_a, slope, len(speed)))
-    return fits
-
-
-def _steady_blocks(
-    time_s: Array, rate_radps: Array, current_a: Array, robot: OmniRobot
-) -> tuple[Array, Array]:
-    """Return magnitudes of mean rate and current (k,) over the blocks at steady speed of one motor."""
-    block = np.floor((time_s - time_s[0]) / BLOCK_S).astype(np.int64)
-    known = np.isfinite(rate_radps) & np.isfinite(current_a)
-    speeds, currents = [], []
-    for number in np.unique(block[known]):
-        rows = known & (block == number)
-        mean = float(np.abs(rate_radps[rows].mean()))
-        if mean < MIN_RATE_RADPS * robot.motors.reduction_ratio:
-            continue
-        if rate_radps[rows].std() <= MAX_SPREAD_RATIO * mean:
-            speeds.append(mean)
-            currents.append(float(np.abs(current_a[rows]).mean()))
-    return np.array(speeds), np.array(currents)
+        lines.append((rest_a, slope, len(speed)))
+    return lines
 
 
 def _driven(runs: Sequence[RunLog], robot: OmniRobot, seed: int) -> list[Finding]:
-    """Return what driving runs under a camera show."""
-    names = [COM_X, COM_Y, RADIUS]
-    slips = _slips(runs, robot, seed)
-    surfaces = {
-        name: [slip for slip, of in slips if of == name] for name in dict.fromkeys(t for _, t in slips)
-    }
-    fitted = [name for name, members in surfaces.items() if _n_steady(members) >= MIN_RUNS]
-    if not fitted:
-        reason = f"no surface on which {MIN_RUNS} runs in steady motion were measured from outside"
-        return undetermined([*names, DISTANCE], reason)
-    kept = [(slip, of) for slip, of in slips if of in fitted]
-    found = roller_findings([slip for slip, _ in kept], [of for _, of in kept], robot, fitted)
-    ids = tuple(slip.run_id for slip, _ in kept)
-    return [
-        *_load(found, robot, ids),
-        _radius(found, robot, ids),
-        _distance({name: surfaces[name] for name in fitted}, robot, seed),
-    ]
+    """Return what driving runs under a camera show: centre of mass, rolling radius and distance of the wheels.
 
-
-def _slips(runs: Sequence[RunLog], robot: OmniRobot, seed: int) -> list[tuple[MeasuredSlip, str]]:
-    """Return the slip of each run that has one, behind the delay of all, and its surface."""
-    delay_s = estimate_delay(runs, robot, seed).applied_s if runs else 0.0
-    slips = []
-    for run in runs:
-        try:
-            slips.append((measured_slip(run, robot, delay_s=delay_s), run.terrains[0]))
-        except DataError:  # too short, or never seen: the filter pose names it
-            continue
-    return slips
-
-
-def _n_steady(slips: Sequence[MeasuredSlip]) -> int:
-    return sum(bool((slip.steady & np.isfinite(slip.body_slip)).any()) for slip in slips)
-
-
-def _load(found: RollerFindings, robot: OmniRobot, ids: tuple[str, ...]) -> list[Finding]:
-    """Return the centre of mass of the loads, and what the intervals of the loads leave open of it.
-
-    Loads sum to 1, so that the centre is ``q + sum n_i (p_i - q)`` for any point q: the best bounds it.
+    Loads sum to 1, so that the centre of mass is ``q + sum n_i (p_i - q)`` for any point q: the best of the wheels
+    bounds it.
     """
-    note = "by the loads " + ", ".join(f"{load:.3f}" for load in found.load_ratio) + " of the wheels"
-    com_m = np.array(found.load_ratio) @ robot.wheel_positions_m
-    half = np.array([(high - low) / 2 for low, high in found.load_interval])
-    apart_m = np.abs(robot.wheel_positions_m - robot.wheel_positions_m[:, None])  # q at each of the wheels
-    half_m = np.einsum("i,qia->qa", half, apart_m).min(axis=0)
-    return [
-        around(name, m, wide, len(ids), "runs", ids, note)
-        for name, m, wide in zip((COM_X, COM_Y), com_m, half_m, strict=True)
-    ]
-
-
-def _radius(found: RollerFindings, robot: OmniRobot, ids: tuple[str, ...]) -> Finding:
-    low, high = found.scale_interval
-    return Finding(
-        RADIUS,
-        (1.0 - found.scale_error) * robot.wheel_radius_m,
-        (1.0 - high) * robot.wheel_radius_m,
-        (1.0 - low) * robot.wheel_radius_m,
-        len(ids),
-        "runs",
-        ids,
-        "or the scale of the outside measurement is off by as much: the runs do not distinguish them",
-    )
-
-
-def _distance(surfaces: Mapping[str, Sequence[MeasuredSlip]], robot: OmniRobot, seed: int) -> Finding:
-    """Return the distance of the wheels: the mean over surfaces, its interval that of all of them."""
-    bounds = {
-        name: bound
-        for name, slips in surfaces.items()
-        if (bound := distance_bound(slips, robot, np.random.default_rng(seed))) is not None
+    measured = measure(runs, robot, window_s=WINDOW_S, stride_s=STRIDE_S, seed=seed)
+    surfaces = {
+        name: own
+        for name, own in measured.by_terrain().items()
+        if sum(bool(slip.known.size) for slip in own.slips) >= MIN_RUNS
     }
+    if not surfaces:
+        reason = f"no surface on which {MIN_RUNS} runs in steady motion were measured from outside"
+        return undetermined([COM_X, COM_Y, RADIUS, DISTANCE], reason)
+    chosen = [
+        pair for pair in zip(measured.runs, measured.slips, strict=True) if pair[0].terrains[0] in surfaces
+    ]
+    names, ids = [run.terrains[0] for run, _ in chosen], [run.run_id for run, _ in chosen]
+    found = roller_findings([slip for _, slip in chosen], names, robot, list(surfaces))
+    loads = "by the loads " + ", ".join(f"{load:.3f}" for load in found.load_ratio) + " of the wheels"
+    place_m, half = robot.wheel_positions_m, np.diff(found.load_interval)[:, 0] / 2
+    apart_m = np.abs(place_m - place_m[:, None])  # q at each of the wheels
+    centre = np.array(found.load_ratio) @ place_m, np.einsum("i,qia->qa", half, apart_m).min(axis=0)
+    findings = [
+        around(name, m, half_m, len(ids), "runs", ids, loads)
+        for name, m, half_m in zip((COM_X, COM_Y), *centre, strict=True)
+    ]
+    ratio, (low, high) = found.scale_error, found.scale_interval
+    value, least, most = ((1.0 - each) * robot.wheel_radius_m for each in (ratio, high, low))
+    or_scale = "or the scale of the outside measurement is off by as much: the runs do not distinguish them"
+    findings.append(Finding(RADIUS, value, least, most, len(ids), "runs", tuple(ids), or_scale))
+    bounds = {name: bound for name, bound in distances_of(measured, robot, seed).items() if name in surfaces}
     if not bounds:
-        return undetermined([DISTANCE], "on no surface do the robot's turns follow its wheels")[0]
+        return [*findings, *undetermined([DISTANCE], "on no surface do the robot's turns follow its wheels")]
     each = ", ".join(f"{bound.distance_m:.4f} m on {name}" for name, bound in bounds.items())
-    return Finding(
+    low, high = np.array([bound.interval_m for bound in bounds.values()]).T
+    distance = Finding(
         DISTANCE,
         float(np.mean([bound.distance_m for bound in bounds.values()])),
-        min(bound.interval_m[0] for bound in bounds.values()),
-        max(bound.interval_m[1] for bound in bounds.values()),
+        float(low.min()),
+        float(high.max()),
         sum(bound.n_runs for bound in bounds.values()),
         "runs",
-        tuple(slip.run_id for name in bounds for slip in surfaces[name]),
+        tuple(slip.run_id for name in bounds for slip in surfaces[name].slips),
         f"{each}: too large by the slip of turning, and off by what else turns the robot; the interval "
         "holds those of all surfaces",
     )
+    return [*findings, distance]

@@ -20,14 +20,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter
 
 from terrain.angles import unwrapped
-from terrain.calibration.finding import Finding, around, biases, undetermined
+from terrain.calibration.finding import Finding, around, undetermined
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError
 from terrain.estimation.feed import MIN_CONFIDENCE_RATIO
@@ -122,22 +121,58 @@ def gyro_bias(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
     walks, count as far as they show within a run.
     """
     names = [f"sensors.gyro_bias_{axis}_radps" for axis in "xyz"]
-    of_run: dict[str, list[Stream]] = {}
+    n, means = 0, dict[str, list[Array]]()
     for stretch in stretches:
         if stream := stretch.of("imu", GYRO):
-            of_run.setdefault(stretch.run.run_id, []).append(stream)
-    if not of_run:
+            n += len(stream)
+            means.setdefault(stretch.run.run_id, []).extend(batch.mean(axis=0) for batch in batches(stream))
+    if not n:
         return undetermined([*names, "sensors.gyro_bias_std_radps"], NO_STANDING)
-    parts = [
-        np.array([batch.mean(axis=0) for stream in streams for batch in batches(stream)])
-        for streams in of_run.values()
-    ]
+    parts = [np.array(part) for part in means.values()]
     found = np.array([part.mean(axis=0) for part in parts])
     variance = np.array([part.var(axis=0, ddof=1) / len(part) for part in parts])
-    n = sum(len(stream) for streams in of_run.values() for stream in streams)
     described = robot.equipment.sensors.gyro_bias_std_radps
-    std_name = "sensors.gyro_bias_std_radps"
-    return biases(names, std_name, found, variance, described, n, "samples", tuple(of_run))
+    return biases(names, found, variance, described, n, "samples", tuple(means))
+
+
+MIN_POWER_ONS = 3  #: From two, the upper end of a scatter's interval is four times the scatter.
+
+
+def biases(
+    names: Sequence[str],
+    found: Array,
+    variance: Array,
+    described_std: float,
+    n: int,
+    counted: str,
+    runs: tuple[str, ...],
+) -> list[Finding]:
+    """Predict the biases of future power-ons, and their scatter, from those of single power-ons.
+
+    Found are (k, 3) biases in each power-on, each run one, with the variances of their errors; the described scatter is
+    taken for true where there is one alone.  However well a bias is known in one power-on, the scatter limits how well
+    it predicts the next one.  The axes share one scatter, as the description has it: k power-ons give 3 (k - 1)
+    degrees of freedom.
+    """
+    k, mean, dof = len(found), found.mean(axis=0), 3 * (len(found) - 1)
+    std_name, note = names[0].replace("_x_", "_std_"), "each run is taken for a power-on"
+    if k == 1:
+        note = f"one power-on: the next differs by {described_std:g}, as described"
+        between, half = math.nan, half_width(np.sqrt(variance[0] + described_std**2), math.inf)
+    else:
+        between = float(((found - mean) ** 2).sum() / dof)
+        half = np.broadcast_to(half_width(math.sqrt(between / k), dof), 3)
+    each = [around(*row, n, counted, runs, note) for row in zip(names, mean, half, strict=True)]
+    if k < MIN_POWER_ONS:
+        return each + undetermined(
+            [std_name], f"{k} power-ons: {MIN_POWER_ONS} at least show how much they differ"
+        )
+    # What a single power-on's own error adds to the scatter is taken off.
+    low, std, high = (
+        math.sqrt(max(edge**2 - float(variance.mean()), 0.0))
+        for edge in sorted((*std_interval(between, dof), math.sqrt(between)))
+    )
+    return [*each, Finding(std_name, std, low, high, k, "power-ons", runs, note)]
 
 
 JUMP_S = 0.075  #: Width of the running median that a relocalisation of the camera stands out from.
@@ -185,7 +220,6 @@ MIN_POSITION_S = 2.0  #: Of a position: "a couple of seconds" (thesis 3.3.3).
 UPRIGHT_SHARE = 0.8  #: An axis points up or down where it carries that much of gravity: within 37 degrees.
 #: Means over batches of this length are as good as independent: an accelerometer at rest has little colour.
 POSITION_BATCH_S = 0.5
-PASSES = 3  #: Each takes the errors of the positions from the fit before; they hardly depend on it.
 
 LEVEL_ONLY = (
     "level standing alone cannot tell: along z a bias looks like a scale, along x and y like a tilt; "
@@ -217,27 +251,24 @@ def fit_gravity(means_mps2: Array, variance: Array) -> tuple[Array, Array, Array
         Parameter(f"{name}_{axis}", v) for name, v in (("bias", 0.0), ("scale", 1.0)) for axis in "xyz"
     ]
 
-    def residual(values: Array, std: Array | float = 1.0) -> Array:
-        return np.asarray(
-            (GRAVITY_MPS2 - np.linalg.norm((means_mps2 - values[:3]) / values[3:], axis=1)) / std
-        )
-
-    for _ in range(PASSES):
+    def residual(values: Array) -> Array:
         force = (means_mps2 - values[:3]) / values[3:]
-        towards = force / np.linalg.norm(force, axis=1)[:, None] / values[3:]  # d|f|/da
-        std = np.sqrt((towards**2 * variance).sum(axis=1))
-        fit = identify(partial(residual, std=std), parameters, starts=[values])
-        values = fit.value
+        size = np.linalg.norm(force, axis=1)
+        towards = force / size[:, None] / values[3:]  # d|f|/da
+        return np.asarray((GRAVITY_MPS2 - size) / np.sqrt((towards**2 * variance).sum(axis=1)))
+
+    fit = identify(residual, parameters, starts=[values])
     dof = len(means_mps2) - 6
     spread = max(float(fit.residual @ fit.residual) / dof, 1.0) if dof else 1.0
-    return values[:3], values[3:], spread * fit.cov
+    return fit.value[:3], fit.value[3:], spread * fit.cov
 
 
 def accelerometer(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
     """Return biases and scales of the accelerometer by runs held in six positions, and how much biases differ."""
-    bias_names = [f"sensors.accel_bias_{axis}_mps2" for axis in "xyz"]
-    scale_names = [f"sensors.accel_scale_{axis}_ratio" for axis in "xyz"]
-    std_name = "sensors.accel_bias_std_mps2"
+    bias_names, scale_names = (
+        [f"sensors.accel_{name}_{axis}_{unit}" for axis in "xyz"]
+        for name, unit in (("bias", "mps2"), ("scale", "ratio"))
+    )
     of_run: dict[str, list[Array]] = {}
     for stretch in stretches:
         if stream := stretch.of("imu", ACCEL):
@@ -255,20 +286,17 @@ def accelerometer(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
         except DataError:
             continue
     if not fits:
-        return undetermined([*bias_names, *scale_names, std_name], LEVEL_ONLY)
+        return undetermined([*bias_names, *scale_names, "sensors.accel_bias_std_mps2"], LEVEL_ONLY)
     runs = tuple(fits)
     n = sum(len(of_run[run_id]) for run_id in runs)
     bias, scale, cov = (np.array(part) for part in zip(*fits.values(), strict=True))
     variance = np.diagonal(cov, axis1=1, axis2=2)
     described = robot.equipment.sensors.accel_bias_std_mps2
     half = half_width(np.sqrt(variance[:, 3:].mean(axis=0) / len(runs)), math.inf)
-    mean = scale.mean(axis=0)
+    scales = zip(scale_names, scale.mean(axis=0), half, strict=True)
     return [
-        *biases(bias_names, std_name, bias, variance[:, :3], described, n, "positions", runs),
-        *(
-            around(name, mean[i], half[i], n, "positions", runs, GRAVITY)
-            for i, name in enumerate(scale_names)
-        ),
+        *biases(bias_names, bias, variance[:, :3], described, n, "positions", runs),
+        *(around(*row, n, "positions", runs, GRAVITY) for row in scales),
     ]
 
 
@@ -280,6 +308,20 @@ LAGS = 10  #: Lags over which noise is looked at for colour.
 NOISE_FLOOR = 1e-5
 
 
+#: Stream and channels whose scatter at rest a number is; those of each wheel with its name for the braces.
+NOISE: Mapping[str, tuple[str, Sequence[str]]] = {
+    "sensors.gyro_std_radps": ("imu", GYRO),
+    "sensors.accel_std_mps2": ("imu", ACCEL),
+    "sensors.yaw_std_rad": ("imu", ("yaw_rad",)),
+    "sensors.motor_std_radps": ("wheels", ("motor_{}_radps",)),
+    "sensors.current_std_a": ("wheels", ("current_{}_a",)),
+    "sensors.steering_std_rad": ("steering", ("angle_{}_rad",)),
+    "camera.speed_std_mps": ("", SEEN[:2]),
+    "camera.yaw_rate_std_radps": ("", SEEN[2:3]),
+    "camera.yaw_std_rad": ("", SEEN[3:]),
+}
+
+
 def sensor_noise(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
     """Return the standard deviation of the noise of each kind of sensor at rest.
 
@@ -289,13 +331,64 @@ def sensor_noise(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
     autocorrelation.  Of the steering angle, the variance of its steps, ``step^2/12``, is taken off: the
     description has the steps by themselves.
     """
-    signals: dict[str, list[tuple[str, Stream]]] = {}
-    for stretch in stretches:
-        for parameter, stream in _signals(stretch, robot).items():
-            signals.setdefault(parameter, []).append((stretch.run.run_id, stream))
     if not stretches:
-        return undetermined(_PARAMETERS, NO_STANDING)
-    return [_noise(parameter, signals.get(parameter, []), robot) for parameter in _PARAMETERS]
+        return undetermined(list(NOISE), NO_STANDING)
+    seen, found = [seen_motion(stretch, robot) for stretch in stretches], []
+    for parameter, (stream, names) in NOISE.items():
+        channels = [
+            name.format(wheel) for name in names for wheel in (robot.wheels if "{" in name else ("",))
+        ]
+        n, runs, left = 0, [], []
+        for stretch, by_camera in zip(stretches, seen, strict=True):
+            signal = stretch.of(stream, channels)
+            if not stream and by_camera is not None:
+                columns = np.column_stack([by_camera.channel(name) for name in channels])
+                signal = Stream(by_camera.time_s, columns, tuple(channels))
+            elif signal is not None and parameter.endswith("_rad"):
+                turned = np.column_stack([unwrapped(column) for column in signal.values.T])
+                signal = Stream(signal.time_s, turned, signal.channels)
+            if signal is not None:
+                n += len(signal)
+                runs.append(stretch.run.run_id)
+                left += [_about_a_line(batch) for batch in batches(signal)]
+        found.append(_noise(parameter, left, n, runs, robot))
+    return found
+
+
+def _noise(parameter: str, residuals: Sequence[Array], n: int, runs: Sequence[str], robot: Robot) -> Finding:
+    """Return the finding of one number by the residuals of batches about straight lines."""
+    section, _, name = parameter.partition(".")
+    described = getattr(getattr(robot.equipment, section), name)
+    if not residuals:
+        return undetermined([parameter], "no standing stretch has this signal")[0]
+    squares = float(sum((part**2).sum() for part in residuals))
+    if squares < sum(part.size for part in residuals) * (NO_NOISE_SHARE * described) ** 2:
+        return undetermined([parameter], "no noise at rest")[0]
+    together = [
+        sum(float((part[lag:] * part[:-lag]).sum()) for part in residuals if len(part) > lag)
+        for lag in range(1, LAGS + 1)
+    ]
+    correlation = np.array(together) / sum(float((part**2).sum()) for part in residuals)
+    # A line takes two samples' worth of white noise with it, and more of coloured noise.
+    taken = 2 * max(1 + 2 * correlation.sum(), 1.0)
+    dof = sum((len(part) - taken) * part.shape[1] for part in residuals)
+    variance = squares / dof
+    low, high = std_interval(variance, dof / (1 + 2 * (correlation**2).sum()))
+    step_variance = 0.0
+    if parameter == "sensors.steering_std_rad":
+        step = 2 * math.pi / robot.equipment.sensors.steering_steps_ratio
+        step_variance = step**2 / 12
+        if variance - step_variance < (MIN_NOISE_STEPS * step) ** 2:
+            return undetermined([parameter], f"the noise hides below the encoder's step of {step:.2g} rad")[0]
+    value, low, high = (math.sqrt(max(x - step_variance, 0.0)) for x in (variance, low**2, high**2))
+    return Finding(parameter, value, low, high, n, "samples", tuple(dict.fromkeys(runs)))
+
+
+def _about_a_line(batch: Array) -> Array:
+    """Return a batch (k, channels) without the straight line that fits each channel best."""
+    x = np.linspace(-1.0, 1.0, len(batch))[:, None]
+    centred = batch - batch.mean(axis=0)
+    return np.asarray(centred - x * (x * centred).sum(axis=0) / (x**2).sum())
 
 
 def measurement_variances(robot: Robot, floor: float = NOISE_FLOOR) -> dict[str, float]:
@@ -334,85 +427,3 @@ def measurement_variances(robot: Robot, floor: float = NOISE_FLOOR) -> dict[str,
         "camera_yaw_rad": camera.yaw_std_rad**2,
     }
     return {row: max(variance, floor) for row, variance in variances.items()}
-
-
-_PARAMETERS = (
-    "sensors.gyro_std_radps",
-    "sensors.accel_std_mps2",
-    "sensors.yaw_std_rad",
-    "sensors.motor_std_radps",
-    "sensors.current_std_a",
-    "sensors.steering_std_rad",
-    "camera.speed_std_mps",
-    "camera.yaw_rate_std_radps",
-    "camera.yaw_std_rad",
-)
-
-
-def _signals(stretch: Stretch, robot: Robot) -> dict[str, Stream]:
-    """Return the signals of a standing stretch by the parameter that is their noise."""
-    channels: Mapping[str, tuple[str, Sequence[str]]] = {
-        "sensors.gyro_std_radps": ("imu", GYRO),
-        "sensors.accel_std_mps2": ("imu", ACCEL),
-        "sensors.yaw_std_rad": ("imu", ("yaw_rad",)),
-        "sensors.motor_std_radps": ("wheels", [f"motor_{i}_radps" for i in robot.wheels]),
-        "sensors.current_std_a": ("wheels", [f"current_{i}_a" for i in robot.wheels]),
-        "sensors.steering_std_rad": ("steering", [f"angle_{i}_rad" for i in robot.wheels]),
-    }
-    found = {name: stream for name, place in channels.items() if (stream := stretch.of(*place))}
-    for name, stream in found.items():
-        if name.endswith("_rad"):
-            turned = np.column_stack([unwrapped(column) for column in stream.values.T])
-            found[name] = Stream(stream.time_s, turned, stream.channels)
-    seen = seen_motion(stretch, robot)
-    if seen is not None:
-        for name, columns in (
-            ("camera.speed_std_mps", [0, 1]),
-            ("camera.yaw_rate_std_radps", [2]),
-            ("camera.yaw_std_rad", [3]),
-        ):
-            found[name] = Stream(
-                seen.time_s, seen.values[:, columns], tuple(seen.channels[i] for i in columns)
-            )
-    return found
-
-
-def _noise(parameter: str, signals: Sequence[tuple[str, Stream]], robot: Robot) -> Finding:
-    section, _, name = parameter.partition(".")
-    described = getattr(getattr(robot.equipment, section), name)
-    residuals = [_about_a_line(batch) for _, stream in signals for batch in batches(stream)]
-    if not residuals:
-        return undetermined([parameter], "no standing stretch has this signal")[0]
-    squares = float(sum((part**2).sum() for part in residuals))
-    if squares < sum(part.size for part in residuals) * (NO_NOISE_SHARE * described) ** 2:
-        return undetermined([parameter], "no noise at rest")[0]
-    correlation = np.array([_correlation(residuals, lag) for lag in range(1, LAGS + 1)])
-    # A line takes two samples' worth of white noise with it, and more of coloured noise.
-    taken = 2 * max(1 + 2 * correlation.sum(), 1.0)
-    dof = sum((len(part) - taken) * part.shape[1] for part in residuals)
-    variance = squares / dof
-    dof /= 1 + 2 * (correlation**2).sum()
-    low, high = std_interval(variance, dof)
-    step_variance = 0.0
-    if parameter == "sensors.steering_std_rad":
-        step = 2 * math.pi / robot.equipment.sensors.steering_steps_ratio
-        step_variance = step**2 / 12
-        if variance - step_variance < (MIN_NOISE_STEPS * step) ** 2:
-            return undetermined([parameter], f"the noise hides below the encoder's step of {step:.2g} rad")[0]
-    value, low, high = (math.sqrt(max(x - step_variance, 0.0)) for x in (variance, low**2, high**2))
-    n = sum(len(stream) for _, stream in signals)
-    runs = tuple(dict.fromkeys(run_id for run_id, _ in signals))
-    return Finding(parameter, value, low, high, n, "samples", runs)
-
-
-def _about_a_line(batch: Array) -> Array:
-    """Return a batch (k, channels) without the straight line that fits each channel best."""
-    x = np.linspace(-1.0, 1.0, len(batch))[:, None]
-    centred = batch - batch.mean(axis=0)
-    return np.asarray(centred - x * (x * centred).sum(axis=0) / (x**2).sum())
-
-
-def _correlation(residuals: Sequence[Array], lag: int) -> float:
-    """Return the autocorrelation over all batches and channels at one lag."""
-    together = sum(float((part[lag:] * part[:-lag]).sum()) for part in residuals if len(part) > lag)
-    return together / sum(float((part**2).sum()) for part in residuals)

@@ -8,12 +8,12 @@ Over steady stretches of a second, with the speeds of the sides by the described
 where rho is the rolling radius of a tyre under its load (of a track that of the sprocket), s the slip of a
 side that drives straight on, and B the effective track, skidding included (Mandow et al., Experimental
 kinematics for wheeled skid-steer mobile robots, IROS 2007).  Radius and slip are separated by an assumption
-on s alone: :data:`SLIP_RATIO` on hard ground, where a tyre rolls on, :data:`SOFT_SLIP_RATIO` elsewhere; the
-interval holds all of it.  B goes with r: with another described radius it scales alike, and it is one of the
-terrain and of the turns driven.
+on s alone: :data:`SLIP_RATIO` on hard ground, where a tyre rolls on, :data:`SOFT_SLIP_RATIO` elsewhere.  B goes with
+r: with another described radius it scales alike, and it is one of the terrain and of the turns driven.
 
 Delays are those at which yaw rates agree best: of lidar and wheels behind the gyro, of the lidar behind the
-wheels where there is no gyro.
+wheels where there is no gyro.  What is assumed (the slip, the resolution of a delay) is in the intervals as an error
+anywhere within its bounds.
 
 Intervals come from a jackknife over sessions, which share weather, ground and mounting, or over runs where
 there are too few sessions: then the next outing may differ by more.
@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +31,7 @@ from scipy.stats import trim_mean
 
 from terrain.calibration.finding import Finding, around, undetermined
 from terrain.identify import half_width, jackknife
+from terrain.kinematics.wheels import TWIST
 from terrain.records import Array, RunLog
 from terrain.signals import peak
 
@@ -50,7 +52,7 @@ MIN_SPEED_MPS = 0.4
 MAX_CURVATURE_PER_M = 0.15  #: Slower, or in a tighter curve, it is not straight driving.
 MIN_YAW_RATE_RADPS = 0.15  #: Slower turns are as small as their errors.
 TRIMMED = 0.2  #: Part of the stretches that is left out at either end: wheels that spin, poses that jump.
-MAX_DELAY_S = 1.0
+N_LAGS = round(1.0 / GRID_S)  #: That are searched to either side.
 MIN_GROUPS = 4
 #: A fifth of a sample of logs at 20 Hz: no number of runs makes an interval narrower.
 DELAY_RESOLUTION_S = 0.01
@@ -61,45 +63,32 @@ LIDAR_DELAY, WHEELS_DELAY = "identified.lidar_delay_s", "identified.wheels_delay
 
 
 class Driven(NamedTuple):
-    """A run on an even grid: sides (n, 2) in m/s, gyro (n,), twist (n, 3) of the lidar; NaN where unknown."""
+    """A run on an even grid."""
 
-    run_id: str
+    run_id: str  #: of the run
     session: str
-    sides_mps: Array
-    gyro_radps: Array
+    sides_mps: Array  #: (n, 2)
+    gyro_radps: Array  #: (n,) NaN where unknown, and the twist (n, 3) of the lidar
     twist: Array
+    lags: tuple[Array, Array] = (np.empty(0), np.empty(0))  #: :func:`lagged_sums` of lidar and wheels
+    stretches: Array = np.empty((0, 4))  #: (m, 4) steady ones: mean, difference of the sides, speed, yaw rate
 
 
 def driven(run: RunLog) -> Driven | None:
     """Return a run on the grid of this module; None where it has no lidar or no sides."""
     wheels, lidar = run.streams.get("wheels"), run.streams.get("lidar")
     sides = ("speed_left_mps", "speed_right_mps")
-    twist = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
     if wheels is None or lidar is None or not set(sides) <= set(wheels.channels):
         return None
     grid_s = np.arange(wheels.time_s[0], wheels.time_s[-1], GRID_S)
-    imu = run.streams.get("imu")
-    gyro = np.full(len(grid_s), np.nan)
+    imu, gyro = run.streams.get("imu"), np.full(len(grid_s), np.nan)
     if imu is not None and "gyro_z_radps" in imu.channels:
         gyro = np.interp(grid_s, imu.time_s, imu.channel("gyro_z_radps"), left=np.nan, right=np.nan)
-    return Driven(
-        run.run_id,
-        run.session,
-        np.column_stack([np.interp(grid_s, wheels.time_s, wheels.channel(name)) for name in sides]),
-        gyro,
-        np.column_stack([np.interp(grid_s, lidar.time_s, lidar.channel(name)) for name in twist]),
+    speeds, twist = (
+        np.column_stack([np.interp(grid_s, stream.time_s, stream.channel(name)) for name in names])
+        for stream, names in ((wheels, sides), (lidar, TWIST))
     )
-
-
-class Summary(NamedTuple):
-    """What one run shows."""
-
-    run_id: str  #: of the run
-    session: str
-    #: (m, 4) of steady ones: mean and difference of the sides, speed and yaw rate of the lidar
-    stretches: Array
-    lidar_sums: Array  #: (lags, 3) sums of products and squares of yaw rates at each lag
-    wheels_sums: Array
+    return Driven(run.run_id, run.session, speeds, gyro, twist)
 
 
 def identify(runs: Sequence[RunLog], wheel_radius_m: float, hard: Sequence[str]) -> list[Finding]:
@@ -110,118 +99,98 @@ def identify(runs: Sequence[RunLog], wheel_radius_m: float, hard: Sequence[str])
     """
     labelled = any(run.labels for run in runs)
     chosen = [run for run in runs if not labelled or (run.terrains and set(run.terrains) <= set(hard))]
-    found = [each for run in chosen if (each := driven(run)) is not None]
-    names = [RADIUS, TRACK, LIDAR_DELAY, WHEELS_DELAY]
-    if not found:
+    logs = [log for run in chosen if (log := driven(run)) is not None]
+    if not logs:
         why = "no run has the streams lidar and wheels"
         if labelled and not chosen:
             why = f"no run is labelled as hard ground ({', '.join(hard)})"
-        return undetermined(names, why)
-    any_gyro = any(np.isfinite(each.gyro_radps).any() for each in found)
-    summaries = [_summary(each, any_gyro) for each in found]
-    delay_s, _ = _lidar_delay(summaries)
+        return undetermined([RADIUS, TRACK, LIDAR_DELAY, WHEELS_DELAY], why)
+    any_gyro = any(np.isfinite(log.gyro_radps).any() for log in logs)
+    for i, log in enumerate(logs):
+        turn = np.diff(log.sides_mps, axis=1)[:, 0]
+        first = log.gyro_radps if any_gyro else turn
+        logs[i] = log._replace(lags=(lagged_sums(first, log.twist[:, 2]), lagged_sums(first, turn)))
+    delay_s = best_lag(0, logs)[0]
     shift = max(round(delay_s / GRID_S), 0) if math.isfinite(delay_s) else 0
-    summaries = [
-        summary._replace(stretches=_steady(each, shift))
-        for summary, each in zip(summaries, found, strict=True)
-    ]
-    groups = _groups(summaries)
+    logs = [log._replace(stretches=steady_stretches(log, shift)) for log in logs]
+    sessions: dict[str, list[Driven]] = {}
+    for log in logs:
+        sessions.setdefault(log.session, []).append(log)
+    groups = list(sessions.values())
+    if "" in sessions or len(groups) < MIN_GROUPS:
+        groups = [[log] for log in logs]
     low, high = SLIP_RATIO if labelled else SOFT_SLIP_RATIO
+    least, most = wheel_radius_m / (1 - low), wheel_radius_m / (1 - high)
     where = "hard ground" if labelled else "unlabelled ground"
-    rolling = _jackknifed(
-        RADIUS,
-        groups,
-        lambda some: _trimmed(wheel_radius_m * _straight(some)),
-        f"slip of {100 * low:g} to {100 * high:g} % assumed in straight driving on {where}: only the radius "
-        "less the slip is to be seen",
-    )
-    rolling = rolling._replace(
-        value=rolling.value * (1 / (1 - low) + 1 / (1 - high)) / 2,
-        low=rolling.low / (1 - low),
-        high=rolling.high / (1 - high),
-    )
-    track_note = f"skidding included, by the described radius, on {where}"
     behind = "behind the gyro" if any_gyro else "behind the wheels: there is no gyro"
-    wheels_delay = _jackknifed(WHEELS_DELAY, groups, _wheels_delay, behind)
-    if not any_gyro:
-        (wheels_delay,) = undetermined([WHEELS_DELAY], "there is no gyro")
-    return [
-        rolling,
-        _jackknifed(TRACK, groups, _track, track_note),
-        _jackknifed(LIDAR_DELAY, groups, _lidar_delay, behind),
-        wheels_delay,
+    assumed = (
+        f"slip of {100 * low:g} to {100 * high:g} % assumed in straight driving on {where}: only the radius "
+        "less the slip is to be seen"
+    )
+    delays = "runs", DELAY_RESOLUTION_S, behind
+    rows: list[tuple[str, Callable[[Sequence[Driven]], tuple[float, int]], str, float, str]] = [
+        (
+            RADIUS,
+            partial(rolling_radius, (least + most) / 2),
+            "steady stretches",
+            (most - least) / 2,
+            assumed,
+        ),
+        (TRACK, track, "steady stretches", 0.0, f"skidding included, by the described radius, on {where}"),
+        (LIDAR_DELAY, partial(best_lag, 0), *delays),
+        (WHEELS_DELAY, partial(best_lag, 1), *delays),
     ]
+    findings = [over_groups(groups, *row) for row in rows]
+    return findings if any_gyro else [*findings[:3], *undetermined([WHEELS_DELAY], "there is no gyro")]
 
 
-def _groups(found: Sequence[Summary]) -> list[list[Summary]]:
-    """Return the runs by session, or one by one where there are too few sessions."""
-    sessions: dict[str, list[Summary]] = {}
-    for each in found:
-        sessions.setdefault(each.session, []).append(each)
-    if "" not in sessions and len(sessions) >= MIN_GROUPS:
-        return list(sessions.values())
-    return [[each] for each in found]
-
-
-def _jackknifed(
+def over_groups(
+    groups: Sequence[list[Driven]],
     name: str,
-    groups: Sequence[list[Summary]],
-    estimate: Callable[[Sequence[Summary]], tuple[float, int]],
+    estimate: Callable[[Sequence[Driven]], tuple[float, int]],
+    counted: str,
+    bounded: float,
     note: str,
 ) -> Finding:
-    """Return an estimate with the interval of a jackknife over those groups that take part in it."""
+    """Return an estimate with the interval of a jackknife over those groups that take part in it.
+
+    An estimate gives its value, and how many of what is counted it is from; ``bounded`` is on either side of it.
+    """
     used = [group for group in groups if estimate(group)[1]]
     k = len(used)
     if k < MIN_GROUPS:
-        reason = (
-            f"{k} runs or sessions show it: {MIN_GROUPS} at least, of steady driving straight on and in turns"
-        )
-        return undetermined([name], reason)[0]
-    value, n = estimate([each for group in used for each in group])
-    std = jackknife(lambda some: estimate([each for i in some for each in used[i]])[0], k)
-    of_grid = DELAY_RESOLUTION_S if name in (LIDAR_DELAY, WHEELS_DELAY) else 0.0
-    half = math.hypot(float(half_width(std, k - 1)), of_grid)
+        return undetermined(
+            [name],
+            f"{k} runs or sessions show it: {MIN_GROUPS} at least, of steady driving straight on and in turns",
+        )[0]
+    every = [log for group in used for log in group]
+    value, n = estimate(every)
+    std = jackknife(lambda some: estimate([log for i in some for log in used[i]])[0], k)
+    half = float(half_width(std, k - 1, bounded=bounded))
     if not math.isfinite(value) or not math.isfinite(half):
         return undetermined([name], "nothing in the runs shows it")[0]
-    runs = tuple(each.run_id for group in used for each in group)
-    counted = "steady stretches" if name in (RADIUS, TRACK) else "runs"
-    return around(name, value, half, n, counted, runs, note)
+    return around(name, value, half, n, counted, [log.run_id for log in every], note)
 
 
-def _summary(run: Driven, any_gyro: bool) -> Summary:
-    wheels = run.sides_mps[:, 1] - run.sides_mps[:, 0]
-    first = run.gyro_radps if any_gyro else wheels
-    return Summary(
-        run.run_id,
-        run.session,
-        np.empty((0, 4)),
-        _lagged_sums(first, run.twist[:, 2]),
-        _lagged_sums(first, wheels),
-    )
-
-
-def _lagged_sums(first: Array, late: Array) -> Array:
+def lagged_sums(first: Array, late: Array) -> Array:
     """Return sums (lags, 3) of the products and squares of two signals, one later by each lag."""
-    n = round(MAX_DELAY_S / GRID_S)
-    sums = np.zeros((2 * n + 1, 3))
-    for i, lag in enumerate(range(-n, n + 1)):
+    sums = []
+    for lag in range(-N_LAGS, N_LAGS + 1):
         a, b = (first[: len(first) - lag], late[lag:]) if lag >= 0 else (first[-lag:], late[:lag])
         there = np.isfinite(a) & np.isfinite(b)
         a, b = a[there], b[there]
-        sums[i] = a @ b, a @ a, b @ b
-    return sums
+        sums.append((a @ b, a @ a, b @ b))
+    return np.array(sums)
 
 
-def _steady(run: Driven, shift: int) -> Array:
-    """Return the steady stretches (m, 4) of :class:`Summary`, with the lidar earlier by ``shift`` samples.
+def steady_stretches(log: Driven, shift: int) -> Array:
+    """Return the steady stretches (m, 4) of :class:`Driven`, with the lidar earlier by ``shift`` samples.
 
     A lidar's twists may have holes: what is averaged are the samples that it has, half of them at least.
     """
     n = round(STRETCH_S / GRID_S)
-    length = len(run.sides_mps) - shift
-    if length < n:
-        return np.empty((0, 4))
-    sides, twist = run.sides_mps[:length], run.twist[shift : shift + length]
+    length = max(len(log.sides_mps) - shift, 0)
+    sides, twist = log.sides_mps[:length], log.twist[shift : shift + length]
     table = np.column_stack([sides.mean(axis=1), sides[:, 1] - sides[:, 0], twist[:, 0], twist[:, 2]])
     parts = table[: length // n * n].reshape(-1, n, 4)
     change = np.abs(parts[:, : n // 2, :2].mean(axis=1) - parts[:, n // 2 :, :2].mean(axis=1))
@@ -232,40 +201,28 @@ def _steady(run: Driven, shift: int) -> Array:
     return np.asarray((np.nan_to_num(parts[steady]) * weight).sum(axis=1))
 
 
-def _straight(some: Sequence[Summary]) -> Array:
-    """Return the speed of the lidar over that of the wheels of straight stretches."""
-    speed, _, forward, turn = np.concatenate([each.stretches for each in some]).T
+def rolling_radius(described_m: float, some: Sequence[Driven]) -> tuple[float, int]:
+    """Return the radius by straight stretches, trimmed, and their number; a jackknife does not judge a median right."""
+    speed, _, forward, turn = np.concatenate([log.stretches for log in some]).T
     straight = (np.abs(speed) >= MIN_SPEED_MPS) & (np.abs(turn) <= MAX_CURVATURE_PER_M * np.abs(speed))
-    return np.asarray(forward[straight] / speed[straight])
+    ratio = forward[straight] / speed[straight]
+    return (described_m * float(trim_mean(ratio, TRIMMED)) if len(ratio) else math.nan), len(ratio)
 
 
-def _trimmed(values: Array) -> tuple[float, int]:
-    """Return the trimmed mean and the number of values; a jackknife does not judge a median right."""
-    return (float(trim_mean(values, TRIMMED)) if len(values) else math.nan), len(values)
-
-
-def _track(some: Sequence[Summary]) -> tuple[float, int]:
+def track(some: Sequence[Driven]) -> tuple[float, int]:
     """Return the difference of the sides over the yaw rate of stretches that turn, and how many they are."""
-    stretches = np.concatenate([each.stretches for each in some])
+    stretches = np.concatenate([log.stretches for log in some])
     _, across, _, turn = stretches[np.abs(stretches[:, 3]) >= MIN_YAW_RATE_RADPS].T
     return (float(across @ turn / (turn @ turn)) if len(turn) else math.nan), len(turn)
 
 
-def _lidar_delay(some: Sequence[Summary]) -> tuple[float, int]:
-    return _best_lag([each.lidar_sums for each in some])
-
-
-def _wheels_delay(some: Sequence[Summary]) -> tuple[float, int]:
-    return _best_lag([each.wheels_sums for each in some])
-
-
-def _best_lag(of_runs: Sequence[Array]) -> tuple[float, int]:
+def best_lag(which: int, some: Sequence[Driven]) -> tuple[float, int]:
     """Return the lag in s at which two yaw rates are most alike, and the number of runs that show them."""
-    n = round(MAX_DELAY_S / GRID_S)
-    turning = [sums for sums in of_runs if sums[:, 1:].min() > 0.0 and sums[n, 1] >= MIN_TURN_SUM]
+    sums = [log.lags[which] for log in some]
+    turning = [each for each in sums if each[:, 1:].min() > 0.0 and each[N_LAGS, 1] >= MIN_TURN_SUM]
     if not turning:
         return math.nan, 0
     products, one, other = np.sum(turning, axis=0).T
-    lags_s = GRID_S * np.arange(-n, n + 1)
+    lags_s = GRID_S * np.arange(-N_LAGS, N_LAGS + 1)
     best_s = peak(lags_s, products / np.sqrt(one * other))
     return (best_s if abs(best_s) < lags_s[-1] else math.nan), len(turning)

@@ -106,25 +106,30 @@ class SlipRegressor(RegressorMixin, BaseEstimator):
     def predict_slip(self, X: Array) -> PredictedSlip:
         """Return the slip of windows with its interval; NaN where the robot stands or a wheel speed lacks."""
         n_wheels = self.columns.n_wheels
-        speed = X[:, :n_wheels]
+        speed, responses = np.split(X, [n_wheels], axis=1)
         known = np.isfinite(speed).all(axis=1) & (np.linalg.norm(np.nan_to_num(speed), axis=1) > 0.0)
-        out = np.full((4, len(X)), np.nan)
-        rows = np.flatnonzero(known)
+        out, rows = np.full((4, len(X)), np.nan), np.flatnonzero(known)
         if rows.size:
             weight = np.ones((rows.size, 1))
             if self.classifier_ is not None:
                 weight = self.classifier_.predict_proba(X[rows])
             regime = regimes(speed[rows], self.fastest_mps_)
-            responses = X[rows, n_wheels:]
             parts = [
-                _given(ground.expected(regime), ground.covariance, responses) for ground in self.grounds_
+                _given(ground.expected(regime), ground.covariance, responses[rows])
+                for ground in self.grounds_
             ]
             mean, variance = (np.column_stack(part) for part in zip(*parts, strict=True))
             slip = (weight * mean).sum(axis=1)
             std = np.sqrt((weight * (variance + mean**2)).sum(axis=1) - slip**2)
-            low = _quantile(weight, mean, np.sqrt(variance), TAIL)
-            high = _quantile(weight, mean, np.sqrt(variance), 1.0 - TAIL)
-            out[:, rows] = slip, std, low, high
+            # the quantiles of the mixtures, by bisection
+            each, probability = np.sqrt(variance), np.array([[TAIL], [1.0 - TAIL]])
+            low, high = (mean - 8.0 * each).min(axis=1), (mean + 8.0 * each).max(axis=1)
+            for _ in range(_BISECTIONS):
+                middle = (low + high) / 2
+                within = norm.cdf((middle[..., None] - mean) / each)
+                below = (weight * within).sum(axis=-1) < probability
+                low, high = np.where(below, middle, low), np.where(below, high, middle)
+            out[:, rows] = slip, std, *((low + high) / 2)
         return PredictedSlip(*out)
 
 
@@ -142,16 +147,6 @@ def _given(expected: Array, covariance: Array, responses: Array) -> tuple[Array,
             mean[rows] += apart[rows][:, pattern] @ slope
             variance[rows] -= covariance[:-1, -1][pattern] @ slope
     return mean, variance
-
-
-def _quantile(weight: Array, mean: Array, std: Array, probability: float) -> Array:
-    """Return the quantile (n,) of mixtures of normal distributions (n, k), by bisection."""
-    low, high = (mean - 8.0 * std).min(axis=1), (mean + 8.0 * std).max(axis=1)
-    for _ in range(_BISECTIONS):
-        middle = (low + high) / 2
-        below = (weight * norm.cdf((middle[:, None] - mean) / std)).sum(axis=1) < probability
-        low, high = np.where(below, middle, low), np.where(below, high, middle)
-    return np.asarray((low + high) / 2)
 
 
 N_FOLDS = 5

@@ -51,7 +51,7 @@ from scipy.special import ndtr, ndtri, stdtrit
 from terrain.bootstrap import bootstrap_rows
 from terrain.constants import GRAVITY_MPS2
 from terrain.identify import Parameter, identify, select
-from terrain.records import Array, read_only
+from terrain.records import Array
 from terrain.robots import Robot
 from terrain.slip_learning.forces import RunBins, slip_range
 
@@ -199,33 +199,24 @@ def fit_curve(law: str, runs: Sequence[RunBins], start: Sequence[float] | None =
     search and then renewed.  If it changed within the search, a steep curve would excuse its own residuals.
     """
     pooled = _Pooled(runs)
-    guesses = _starts(law, pooled) if start is None else [np.asarray(start)]
-    found = [_search(pooled, law, guess, renew=start is None) for guess in guesses]
-    return tuple(min(found, key=lambda theta: pooled.cost(law, theta)).tolist())
-
-
-def _parameters(law: str, near: Array) -> list[Parameter]:
-    """Return the parameters of a law, to be searched from values that are near."""
-    rows = zip(LAW_PARAMETERS[law], near.tolist(), *LAW_BOUNDS[law], strict=True)
-    return [
-        Parameter(name, mean, low, high, std, max(abs(value), 0.1))
-        for name, value, low, high in rows
-        for mean, std in [_PRIOR.get(name, (value, math.inf))]
-    ]
-
-
-def _search(pooled: _Pooled, law: str, guess: Array, renew: bool) -> Array:
-    """Return the parameters of least cost near a guess, with the variance of bins renewed twice or never."""
     low, high = (np.array(bound) for bound in LAW_BOUNDS[law])
-    theta = np.clip(guess, low + 1e-6, high - 1e-6)
-    variance = pooled.std**2 if renew else pooled.variance(law, theta)
-    for _ in range(3 if renew else 1):
-        residual = partial(pooled.residuals, law=law, variance=variance)
-        own = _parameters(law, theta)
-        found = identify(residual, own, starts=[theta], xtol=1e-5, ftol=1e-5, max_nfev=60)
-        theta = np.clip(found.value, low + 1e-6, high - 1e-6)
-        variance = pooled.variance(law, theta)
-    return np.asarray(theta)
+    rows, best, least = list(zip(LAW_PARAMETERS[law], *LAW_BOUNDS[law], strict=True)), (), math.inf
+    for guess in _starts(law, pooled) if start is None else [np.asarray(start)]:
+        theta = np.clip(guess, low + 1e-6, high - 1e-6)
+        variance = pooled.std**2 if start is None else pooled.variance(law, theta)
+        for _ in range(3 if start is None else 1):
+            parameters = [
+                Parameter(name, *(mean, lowest, highest, std), max(abs(value), 0.1))
+                for (name, lowest, highest), value in zip(rows, theta.tolist(), strict=True)
+                for mean, std in [_PRIOR.get(name, (value, math.inf))]
+            ]
+            residual = partial(pooled.residuals, law=law, variance=variance)
+            found = identify(residual, parameters, starts=[theta], xtol=1e-5, ftol=1e-5, max_nfev=60)
+            theta = np.clip(found.value, low + 1e-6, high - 1e-6)
+            variance = pooled.variance(law, theta)
+        if (cost := pooled.cost(law, theta)) < least or not best:
+            best, least = tuple(theta.tolist()), cost
+    return best
 
 
 def _starts(law: str, pooled: _Pooled) -> list[Array]:
@@ -268,6 +259,7 @@ def select_law(runs: Sequence[RunBins]) -> tuple[str, tuple[float, ...], dict[st
 
 
 INTERVAL = 0.9  #: Probability with which an interval contains the peak slip
+QUANTILE = float(ndtri(0.5 + INTERVAL / 2))  #: Of the normal law
 EDGE_SLIP = 0.03  #: A maximum this near the end of the observed slips may still rise beyond it
 
 NEAR_PEAK_RATIO = 0.95
@@ -340,6 +332,7 @@ def peak_interval(
 
     What all runs share is the radius' error, and a tilt of the curve by :data:`SHAPE_STD_RATIO` over the peak's slip,
     or over the observed slips where there is no peak; it moves a flat peak further to one side than to the other.
+    Runs that determine it have slips beyond it or, without a peak, in the upper half.
 
     Parameters
     ----------
@@ -349,24 +342,16 @@ def peak_interval(
     tilted_net : net traction at each of an array of slips, of the thrust of the curve times 1 and a tilt a slip
     slip_range : smallest and largest slip observed
     """
-    quantile = float(ndtri(0.5 + INTERVAL / 2))
-    over = peak.slip_ratio if peak.status is PeakStatus.PEAK else slip_range[1]
-    tilt = quantile * SHAPE_STD_RATIO / max(over, EDGE_SLIP)
-    less, more = (
+    sharp = peak.status is PeakStatus.PEAK
+    tilt = QUANTILE * SHAPE_STD_RATIO / max(peak.slip_ratio if sharp else slip_range[1], EDGE_SLIP)
+    moved = (
         abs(net_peak(partial(tilted_net, by), *slip_range, peak.status, 1001).slip_ratio - peak.slip_ratio)
         for by in (-tilt, tilt)
     )
-    shared = (
-        math.hypot(less, quantile * SYSTEMATIC_SLIP_STD),
-        math.hypot(more, quantile * SYSTEMATIC_SLIP_STD),
-    )
-    return expanded_interval(draws, n_informative_runs(runs, peak, slip_range[1]), peak.slip_ratio, shared)
-
-
-def n_informative_runs(runs: Sequence[RunBins], peak: Peak, high_slip: float) -> int:
-    """Return how many runs determine a peak, at least 2: with slips beyond it, or in the upper half."""
-    beyond = peak.slip_ratio if peak.status is PeakStatus.PEAK else high_slip / 2
-    return max(2, sum(bool((run.slip_ratio > beyond).any()) for run in runs))
+    less, more = (math.hypot(by, QUANTILE * SYSTEMATIC_SLIP_STD) for by in moved)
+    beyond = peak.slip_ratio if sharp else slip_range[1] / 2
+    informative = max(2, sum(bool((run.slip_ratio > beyond).any()) for run in runs))
+    return expanded_interval(draws, informative, peak.slip_ratio, (less, more))
 
 
 def expanded_interval(
@@ -397,26 +382,6 @@ MIN_THRUST_RATIO = 0.02  #: Ice gives more: a curve that stays below is one with
 N_BOOTSTRAP = 300  #: Draws of the bootstrap over runs
 
 
-class Band(NamedTuple):
-    """Slips (m,), and the 5 and 95 % quantiles of the thrust over load at each."""
-
-    slip_ratio: Array
-    low_ratio: Array
-    high_ratio: Array
-
-
-class Resistances(NamedTuple):
-    """Resistance over load of each run (runs,) and its standard deviation; NaN where it is not known."""
-
-    ratio: Array
-    std: Array
-
-    @property
-    def known(self) -> Array:
-        """Whether (runs,) both are finite."""
-        return np.asarray(np.isfinite(self.ratio) & np.isfinite(self.std))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class SlipCurve:
     """What was learned of one terrain."""
@@ -435,48 +400,25 @@ class SlipCurve:
     #: slip gives it
     working_slip_ratio: float
     working_std: float
-    band: Band  #: of the law over the bootstrap
+    band: Array  #: (3, m) slips, and the 5 and 95 % quantiles of the law over the bootstrap at each
     n_runs: int  #: the curve is fitted to
     #: mean log likelihood of a left-out run, by law; and ``none``, of one thrust for all slips
     scores: Mapping[str, float]
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "band", Band(*(read_only(column) for column in self.band)))
-
     @property
     def peak_std(self) -> float:
         """Standard deviation of a normal law with the same interval."""
-        return (self.peak_interval[1] - self.peak_interval[0]) / (2 * float(ndtri(0.5 + INTERVAL / 2)))
+        return (self.peak_interval[1] - self.peak_interval[0]) / (2 * QUANTILE)
 
     def thrust_ratio(self, slip_ratio: Array) -> Array:
         """Return the thrust over load (n,) at each slip (n,)."""
         return traction_ratio(self.law, self.parameters, slip_ratio)
 
 
-class _Model(NamedTuple):
-    """Law, its parameters, and the resistance over load."""
-
-    law: str
-    parameters: tuple[float, ...]
-    resistance_ratio: float
-
-    def thrust(self, slip_ratio: Array) -> Array:
-        return traction_ratio(self.law, self.parameters, slip_ratio)
-
-    def net_traction(self, slip_ratio: Array) -> Array:
-        return self.thrust(slip_ratio) - self.resistance_ratio
-
-    def tilted_net(self, tilt: float, slip_ratio: Array) -> Array:
-        return self.thrust(slip_ratio) * (1.0 + tilt * slip_ratio) - self.resistance_ratio
-
-    def slip_of(self, net_ratio: float, high_slip: float = 1.0) -> float:
-        """Return the smallest slip with a net traction; NaN where no slip has it."""
-        return slip_at(self.law, self.parameters, self.resistance_ratio + net_ratio, high_slip)
-
-
 def learn_curve(
     runs: Sequence[RunBins],
-    resistances: Resistances,
+    resistance_ratio: Array,
+    resistance_std: Array,
     rng: np.random.Generator,
     n_bootstrap: int = N_BOOTSTRAP,
 ) -> SlipCurve:
@@ -485,7 +427,7 @@ def learn_curve(
     Parameters
     ----------
     runs : at least :data:`MIN_RUNS` with bins
-    resistances : of each run
+    resistance_ratio, resistance_std : (runs,) resistance over load of each run and its deviation; NaN where unknown
     rng : of the bootstrap
     n_bootstrap : how many draws of runs
 
@@ -498,43 +440,43 @@ def learn_curve(
         raise ValueError(why)
     low, high = slip_range(runs)
     law, parameters, scores = select_law(runs)
-    rho, rho_std = weighted_resistance(resistances)
+    rho, rho_std = weighted_resistance(resistance_ratio, resistance_std)
     rho = 0.0 if -2 * rho_std < rho < 0 else rho  # slightly negative: not significantly different from none
-    model = _Model(law, parameters, rho)
-    rows = bootstrap_rows(len(runs), n_bootstrap, rng)
-    draws = [_refitted(model, runs, resistances, drawn) for drawn in rows]
-    peak = net_peak(model.net_traction, low, high)
-    peaks = np.array([net_peak(draw.net_traction, low, high, peak.status, 1001).slip_ratio for draw in draws])
-    slips = np.linspace(0.0, high, 101)
-    thrusts = np.array([draw.thrust(slips) for draw in draws])
+
+    def net(theta: Sequence[float], resistance: float, tilt: float, slips: Array) -> Array:
+        return traction_ratio(law, theta, slips) * (1.0 + tilt * slips) - resistance
+
+    peak = net_peak(partial(net, parameters, rho, 0.0), low, high)
+    slips, peaks, thrusts, places = np.linspace(0.0, high, 101), [], [], []
+    for drawn in bootstrap_rows(len(runs), n_bootstrap, rng):
+        theta = fit_curve(law, [runs[i] for i in drawn], parameters)
+        again, _ = weighted_resistance(resistance_ratio[drawn], resistance_std[drawn])
+        again = rho if math.isnan(again) else again
+        peaks.append(net_peak(partial(net, theta, again, 0.0), low, high, peak.status, 1001).slip_ratio)
+        thrusts.append(traction_ratio(law, theta, slips))
+        places.append([slip_at(law, theta, again + by) for by in (0.0, WORKING_TRACTION_RATIO)])
+    balance_std, working_std = (_std_over_runs(column, len(runs)) for column in np.array(places).T)
     return SlipCurve(
         law=law,
-        parameters=model.parameters,
+        parameters=parameters,
         resistance_ratio=rho,
         resistance_std=rho_std,
         slip_range=(low, high),
         peak=peak,
-        peak_interval=peak_interval(peaks, runs, peak, model.tilted_net, (low, high)),
-        balance_slip_ratio=model.slip_of(0.0),
-        balance_std=_std_over_runs([draw.slip_of(0.0) for draw in draws], len(runs)),
-        working_slip_ratio=model.slip_of(WORKING_TRACTION_RATIO, high),
-        working_std=_std_over_runs([draw.slip_of(WORKING_TRACTION_RATIO) for draw in draws], len(runs)),
-        band=Band(slips, *np.quantile(thrusts, [(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], axis=0)),
+        peak_interval=peak_interval(np.array(peaks), runs, peak, partial(net, parameters, rho), (low, high)),
+        balance_slip_ratio=slip_at(law, parameters, rho),
+        balance_std=balance_std,
+        working_slip_ratio=slip_at(law, parameters, rho + WORKING_TRACTION_RATIO, high),
+        working_std=working_std,
+        band=np.vstack([slips, np.quantile(thrusts, [(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], axis=0)]),
         n_runs=len(runs),
         scores={name: float(np.mean(values)) for name, values in scores.items()},
     )
 
 
-def _refitted(model: _Model, runs: Sequence[RunBins], resistances: Resistances, drawn: Array) -> _Model:
-    """Return the model fitted to the runs of one bootstrap draw."""
-    parameters = fit_curve(model.law, [runs[i] for i in drawn], model.parameters)
-    rho, _ = weighted_resistance(Resistances(resistances.ratio[drawn], resistances.std[drawn]))
-    return _Model(model.law, parameters, model.resistance_ratio if math.isnan(rho) else rho)
-
-
-def _std_over_runs(draws: Sequence[float], n_runs: int) -> float:
+def _std_over_runs(draws: Array, n_runs: int) -> float:
     """Return the standard deviation of a slip by its draws and what all runs share; NaN without any."""
-    known = np.array(draws)[np.isfinite(draws)]
+    known = draws[np.isfinite(draws)]
     if len(known) < 2:
         return math.nan
     return math.hypot(float(np.std(known)) * math.sqrt(n_runs / (n_runs - 1)), SYSTEMATIC_SLIP_STD)
@@ -570,12 +512,12 @@ def contradiction(curve: SlipCurve) -> str | None:
     return None
 
 
-def weighted_resistance(resistances: Resistances) -> tuple[float, float]:
-    """Return the weighted mean of the runs' resistance over load and its std; NaN where none is known."""
-    ratio, std = resistances.ratio[resistances.known], resistances.std[resistances.known]
-    if not len(ratio):
+def weighted_resistance(ratio: Array, std: Array) -> tuple[float, float]:
+    """Return the weighted mean of the runs' resistance over load (runs,) and its std; NaN where none is known."""
+    known = np.isfinite(ratio) & np.isfinite(std)
+    if not known.any():
         return math.nan, math.nan
-    weight = std**-2.0
+    ratio, weight = ratio[known], std[known] ** -2.0
     mean = float(ratio @ weight / weight.sum())
     scatter = float(np.sum(weight * (ratio - mean) ** 2) / weight.sum()) / max(len(ratio) - 1, 1)
     return mean, math.sqrt(max(scatter, 1.0 / float(weight.sum())))
@@ -616,51 +558,37 @@ class Targets(NamedTuple):
 
     def of(self, drive_state: str) -> TargetSlip:
         """Return the target of ``traction``, ``braking`` or ``steady``."""
-        return {"traction": self.traction, "braking": self.braking, "steady": self.steady}[drive_state]
+        target: TargetSlip = getattr(self, drive_state)
+        return target
 
 
 def targets_of(curve: SlipCurve) -> Targets:
-    """Return the targets of a terrain: braking <= 0 <= steady <= traction."""
+    """Return the targets of a terrain: braking <= 0 <= steady <= traction.
+
+    Traction is near the peak, but not beyond what a start requires, as more slip only costs energy, and at least
+    :data:`MIN_ABOVE_BALANCE_SLIP` above steady motion.  Braking is the peak slip mirrored; where there is no peak, at
+    most :data:`BRAKING_CAP_SLIP`.
+    """
     n = f"{curve.n_runs} runs, {curve.law}"
+    slip, std, sharp = curve.peak.slip_ratio, curve.peak_std, curve.peak.status is PeakStatus.PEAK
+    name = "the peak slip" if sharp else "the slip at 95 % of the largest traction"
     steady = TargetSlip(
         max(curve.balance_slip_ratio, 0.0), curve.balance_std, f"balance with the resistance; {n}"
     )
-    traction, braking = _traction(curve, steady.slip_ratio), _braking(curve)
-    return Targets(
-        traction._replace(source=f"{traction.source}; {n}"),
-        braking._replace(source=f"{braking.source}; {n}"),
-        steady,
-        PEAK_SLIP_RATIO * curve.peak.slip_ratio,
-        curve.working_slip_ratio,
+    traction = TargetSlip(
+        PEAK_SLIP_RATIO * slip, PEAK_SLIP_RATIO * std, f"{PEAK_SLIP_RATIO:g} of {name}; {n}"
     )
-
-
-def _traction(curve: SlipCurve, steady_slip_ratio: float) -> TargetSlip:
-    """Return the target near the peak, but not beyond what a start requires: more slip only costs energy.
-
-    It is at least :data:`MIN_ABOVE_BALANCE_SLIP` above the steady one.
-    """
-    by_peak = PEAK_SLIP_RATIO * curve.peak.slip_ratio
-    of = (
-        "the peak slip"
-        if curve.peak.status is PeakStatus.PEAK
-        else "the slip at 95 % of the largest traction"
-    )
-    target = TargetSlip(by_peak, PEAK_SLIP_RATIO * curve.peak_std, f"{PEAK_SLIP_RATIO:g} of {of}")
-    if curve.working_slip_ratio < by_peak:
-        target = TargetSlip(curve.working_slip_ratio, curve.working_std, "net traction of a start")
-    least = steady_slip_ratio + MIN_ABOVE_BALANCE_SLIP
-    return TargetSlip(least, curve.balance_std, "just above balance") if target.slip_ratio < least else target
-
-
-def _braking(curve: SlipCurve) -> TargetSlip:
-    """Return the peak slip mirrored; where there is no peak, at most :data:`BRAKING_CAP_SLIP`."""
-    slip, std = curve.peak.slip_ratio, curve.peak_std
-    if curve.peak.status is PeakStatus.PEAK:
-        return TargetSlip(-slip, std, "the peak slip mirrored")
-    if slip > BRAKING_CAP_SLIP:
-        return TargetSlip(-BRAKING_CAP_SLIP, SYSTEMATIC_SLIP_STD, "capped: thrust rises monotonically")
-    return TargetSlip(-slip, std, "the slip at 95 % of the largest traction, mirrored")
+    if curve.working_slip_ratio < traction.slip_ratio:
+        traction = TargetSlip(curve.working_slip_ratio, curve.working_std, f"net traction of a start; {n}")
+    least = steady.slip_ratio + MIN_ABOVE_BALANCE_SLIP
+    if traction.slip_ratio < least:
+        traction = TargetSlip(least, curve.balance_std, f"just above balance; {n}")
+    braking = TargetSlip(-slip, std, f"{name}{'' if sharp else ','} mirrored; {n}")
+    if not sharp and slip > BRAKING_CAP_SLIP:
+        braking = TargetSlip(
+            -BRAKING_CAP_SLIP, SYSTEMATIC_SLIP_STD, f"capped: thrust rises monotonically; {n}"
+        )
+    return Targets(traction, braking, steady, PEAK_SLIP_RATIO * slip, curve.working_slip_ratio)
 
 
 def tractive_efficiency(curve: SlipCurve, slip_ratio: float) -> float:

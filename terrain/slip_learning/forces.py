@@ -42,6 +42,7 @@ from terrain.kernels import njit
 from terrain.kinematics.wheels import TWIST, wheel_frame_velocities
 from terrain.records import Array, Label, RunLog, SlipTrack, StateTrack
 from terrain.robots import Robot
+from terrain.signals import true_stretches
 
 MIN_SPEED_MPS = 0.2  #: At lower speeds, an error of 1 cm/s in the speed is over 5 % of slip
 MAX_SIDE_RATIO = 0.5  #: Lateral over longitudinal slip above which a wheel's longitudinal thrust is not used
@@ -131,25 +132,6 @@ class WheelForces(NamedTuple):
         return inside
 
 
-def ground_thrust(
-    torque_nm: Array,
-    wheel_radps: Array,
-    accel_radps2: Array,
-    friction_nm: float,
-    inertia_kgm2: float,
-    wheel_radius_m: float,
-) -> Array:
-    """Return the thrust of the terrain on a wheel in N, along the wheel's x axis; any shape.
-
-    Examples
-    --------
-    >>> ground_thrust(np.array([20.0]), np.array([5.0]), np.array([10.0]), 0.5, 0.15, 0.2).round(1)
-    array([90.])
-    """
-    friction = friction_nm * np.tanh(wheel_radps / FRICTION_RATE_RADPS)
-    return np.asarray((torque_nm - friction - inertia_kgm2 * accel_radps2) / wheel_radius_m)
-
-
 def wheel_loads(robot: Robot, force_mps2: Array) -> Array:
     """Return the load of each wheel over the robot's mass, (n, 3) N/kg, for the body's specific force (n, 3).
 
@@ -184,13 +166,19 @@ def wheel_forces(
         if the log has no motor currents or no IMU with roll and pitch, or the track no slip speeds.
     """
     robot.require(*robot.sections)
-    _check_channels(run, robot)
+    currents, rates = ([name.format(w) for w in robot.wheels] for name in ("current_{}_a", "motor_{}_radps"))
+    attitude = ["roll_rad", "pitch_rad"]
+    for stream, channels in (("wheels", currents + rates), ("imu", attitude)):
+        present = run.streams[stream].channels if stream in run.streams else ()
+        missing = [channel for channel in channels if channel not in present]
+        if missing:
+            raise DataError(f"run {run.run_id}: stream {stream!r} has no channel {missing[0]!r}")
     if "slip_speed_1_mps" not in track.states:
         raise DataError(f"run {run.run_id}: the track has no slip speeds: estimate it with vio15")
-    clock, sensors = track.time_s, robot.sensors
-    imu, wheels, time_constant_s = run.streams["imu"], run.streams["wheels"], sensors.encoder_time_constant_s
-    angles = {name: imu.channel(name) for name in ("roll_rad", "pitch_rad")}
-    roll, pitch = on_clock(clock, imu.time_s - sensors.imu_latency_s, angles, time_constant_s).values()
+    clock, sensors, motors, body = track.time_s, robot.sensors, robot.motors, robot.body
+    imu, wheels, lag_s = run.streams["imu"], run.streams["wheels"], sensors.encoder_time_constant_s
+    angles = {name: imu.channel(name) for name in attitude}
+    roll, pitch = on_clock(clock, imu.time_s - sensors.imu_latency_s, angles, lag_s).values()
     up = np.column_stack([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
     accel = [track.state("accel_x_mps2"), track.state("accel_y_mps2"), np.zeros(clock.size)]
     force = GRAVITY_MPS2 * up + np.column_stack(accel)
@@ -200,30 +188,26 @@ def wheel_forces(
     forward, left = wheel_frame_velocities(twist, robot.wheel_positions_m, steer)
     wheel_speed = rate * robot.wheel_radius_m
     reference = np.maximum(np.abs(wheel_speed), np.abs(forward))
-    relaxation_m = robot.body.relaxation_length_m
     pairs = zip((wheel_speed - forward).T, reference.T, strict=True)
-    along_slip = np.column_stack([contact_slip(clock, *pair, relaxation_m) for pair in pairs])
+    along_slip = np.column_stack([contact_slip(clock, *pair, body.relaxation_length_m) for pair in pairs])
     side_slip = np.abs(left) / np.maximum(reference, MIN_SPEED_MPS)
     oblique = (side_slip >= SMALL_SLIP) & (side_slip <= MAX_SIDE_RATIO * np.abs(along_slip))
     # length of the slip vector over its longitudinal component, negative where a wheel rolls back
     rolling = np.where(wheel_speed + forward < 0.0, -1.0, 1.0)
     factor = rolling * np.where(oblique, np.hypot(1.0, side_slip / np.where(oblique, along_slip, 1.0)), 1.0)
-    velocity = np.column_stack([track.state("speed_x_mps"), track.state("speed_y_mps")])
-    speed = np.hypot(*velocity.T)
+    speed = np.hypot(*twist[:, :2].T)
     moving = speed > MIN_SPEED_MPS
-    along = np.divide(velocity, speed[:, None], out=np.zeros_like(velocity), where=moving[:, None])
-    currents_a = {name: wheels.channel(name) for name in (f"current_{wheel}_a" for wheel in robot.wheels)}
-    filtered = on_clock(clock, wheels.time_s, currents_a, time_constant_s)
-    torque = np.column_stack(list(filtered.values())) * robot.motors.nm_per_a
+    along = np.divide(twist[:, :2], speed[:, None], out=np.zeros_like(twist[:, :2]), where=moving[:, None])
+    filtered = on_clock(clock, wheels.time_s, {name: wheels.channel(name) for name in currents}, lag_s)
+    torque = np.column_stack(list(filtered.values())) * motors.nm_per_a
+    friction = motors.friction_nm * np.tanh(rate / FRICTION_RATE_RADPS)
     wheel_accel = _smooth(np.gradient(rate, clock, axis=0), clock)
-    resistance = robot.motors.friction_nm, robot.body.wheel_inertia_kgm2, robot.wheel_radius_m
-    thrust = ground_thrust(torque, rate, wheel_accel, *resistance)
-    load = wheel_loads(robot, force)
+    thrust = (torque - friction - body.wheel_inertia_kgm2 * wheel_accel) / robot.wheel_radius_m
+    load, standing = (wheel_loads(robot, each) for each in (force, np.array([[0.0, 0.0, GRAVITY_MPS2]])))
     fresh = ~slip.stale & np.isfinite(track.reference_age_s)
     with np.errstate(invalid="ignore"):
         thrust_change = np.abs(_smooth(np.gradient(thrust, clock, axis=0), clock))
         thrust_rate = thrust_change / np.maximum(robot.mass_kg * load, 1.0)
-    standing = wheel_loads(robot, np.array([[0.0, 0.0, GRAVITY_MPS2]]))
     conditions = {
         "slip known": np.isfinite(slip.slip_ratio) & (slip.slip_std < MAX_SLIP_STD),
         "speed fresh": np.repeat(fresh[:, None], 3, axis=1),
@@ -232,16 +216,16 @@ def wheel_forces(
         "slip followed": np.abs(np.gradient(along_slip, clock, axis=0)) < MAX_SLIP_RATE_PS,
         "thrust followed": thrust_rate < MAX_THRUST_RATE_PS,
         "loaded": load > MIN_LOAD_RATIO * standing,
-        "torque free": np.abs(torque) < MAX_TORQUE_RATIO * robot.motors.torque_max_nm,
+        "torque free": np.abs(torque) < MAX_TORQUE_RATIO * motors.torque_max_nm,
         "current known": np.isfinite(thrust),
-        "attitude known": np.repeat(np.asarray(np.isfinite(load).all(axis=1))[:, None], 3, axis=1),
+        "attitude known": np.isfinite(load).all(axis=1, keepdims=True).repeat(3, axis=1),
     }
     straight = np.abs(left) < math.tan(MAX_SLIP_ANGLE_RAD) * np.abs(forward)
-    balanced = moving & fresh & (np.abs(track.state("yaw_rate_radps")) < MAX_YAW_RATE_RADPS)
+    balanced = moving & fresh & (np.abs(twist[:, 2]) < MAX_YAW_RATE_RADPS)
     known = straight & conditions["current known"] & conditions["attitude known"]
     noise_a = sensors.current_std_a
-    if time_constant_s > 0 and clock.size > 1:  # of white noise behind a low-pass filter at this rate
-        remaining = math.exp(-float(np.median(np.diff(clock))) / time_constant_s)
+    if lag_s > 0 and clock.size > 1:  # of white noise behind a low-pass filter at this rate
+        remaining = math.exp(-float(np.median(np.diff(clock))) / lag_s)
         noise_a *= math.sqrt((1.0 - remaining) / (1.0 + remaining))
     cos_along = np.cos(steer) * along[:, :1] + np.sin(steer) * along[:, 1:]
     return WheelForces(
@@ -255,19 +239,10 @@ def wheel_forces(
         speed_mps=speed,
         grade_mps2=GRAVITY_MPS2 * (up[:, :2] * along).sum(axis=1),
         normal_mps2=force[:, 2],
-        thrust_std_n=noise_a * robot.motors.nm_per_a / robot.wheel_radius_m,
+        thrust_std_n=noise_a * motors.nm_per_a / robot.wheel_radius_m,
         conditions=conditions,
         balance_valid=balanced & known.all(axis=1),
     )
-
-
-def _check_channels(run: RunLog, robot: Robot) -> None:
-    wheels = [name.format(wheel) for name in ("current_{}_a", "motor_{}_radps") for wheel in robot.wheels]
-    for stream, channels in (("wheels", wheels), ("imu", ["roll_rad", "pitch_rad"])):
-        present = run.streams[stream].channels if stream in run.streams else ()
-        missing = [channel for channel in channels if channel not in present]
-        if missing:
-            raise DataError(f"run {run.run_id}: stream {stream!r} has no channel {missing[0]!r}")
 
 
 def _smooth(values: Array, time_s: Array) -> Array:
@@ -289,11 +264,10 @@ def valid_intervals(time_s: Array, valid: Array, length_s: float) -> list[slice]
     if time_s.size < 2:
         return []
     size = max(2, round(length_s / float(np.median(np.diff(time_s)))))
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], valid.astype(int), [0]])))
     return [
         slice(begin, begin + size)
-        for first, last in edges.reshape(-1, 2)
-        for begin in range(int(first), int(last) - size + 1, size)
+        for first, end in true_stretches(valid).tolist()
+        for begin in range(first, end - size + 1, size)
     ]
 
 
@@ -334,46 +308,38 @@ def body_balance(forces: WheelForces, robot: Robot, where: Array) -> Balance:
 
     Notes
     -----
+    The mass is its prior combined with what changes from one mean to the next, with the changes of the acceleration a
+    as the instrument, ``m = sum(da dF) / sum(da df)``: a is the speed gained over each mean and known well,
+    while the attitude has the error of the body's tilt on rough terrain, which would bias m to low values.
     Medians give rho; an attitude wrong by :data:`TILT_STD_RAD` is part of its uncertainty.
     """
     parts = valid_intervals(forces.time_s, forces.balance_valid & where, BALANCE_S)
+    mass_kg, mass_std_kg = robot.mass_kg, robot.mass_kg * MASS_STD_RATIO
     if len(parts) < MIN_MEANS:
-        return Balance(robot.mass_kg, robot.mass_kg * MASS_STD_RATIO, math.nan, math.nan)
+        return Balance(mass_kg, mass_std_kg, math.nan, math.nan)
     thrust_n, grade, normal = (
         np.array([values[part].mean() for part in parts])
         for values in (forces.total_thrust_n, forces.grade_mps2, forces.normal_mps2)
     )
-    ends = [(part.start, part.stop - 1) for part in parts]
-    gained_mps = np.array([forces.speed_mps[b] - forces.speed_mps[a] for a, b in ends])
-    accel = gained_mps / np.array([forces.time_s[b] - forces.time_s[a] for a, b in ends])
-    consecutive = np.diff([part.start for part in parts]) == parts[0].stop - parts[0].start
-    changes = (np.diff(values)[consecutive] for values in (thrust_n, grade + accel, accel))
-    mass_kg, mass_std_kg = _mass(robot.mass_kg, *changes)
+    first, last = np.array([(part.start, part.stop - 1) for part in parts]).T
+    gained_mps = forces.speed_mps[last] - forces.speed_mps[first]
+    accel = gained_mps / (forces.time_s[last] - forces.time_s[first])
+    consecutive = np.diff(first) == parts[0].stop - parts[0].start
+    d_thrust, d_force, d_accel = (np.diff(v)[consecutive] for v in (thrust_n, grade + accel, accel))
+    covariation = float(d_accel @ d_force)
+    found_kg = float(d_accel @ d_thrust) / covariation if covariation > 0.0 else math.nan
+    # a robot that hardly changes its speed may come out at any mass, with a small error from few changes
+    if len(d_accel) >= MIN_MEANS and abs(found_kg - mass_kg) < MAX_MASS_STDS * mass_std_kg:
+        residual = d_accel * (d_thrust - found_kg * d_force)
+        scatter_kg = math.sqrt(float(residual @ residual)) / covariation
+        found_std_kg = math.hypot(scatter_kg, THRUST_STD_RATIO * found_kg)
+        weight = mass_std_kg**2 / (mass_std_kg**2 + found_std_kg**2)
+        mass_kg, mass_std_kg = mass_kg + weight * (found_kg - mass_kg), math.sqrt(weight) * found_std_kg
     ratio = (thrust_n / mass_kg - (grade + accel)) / normal
     rho = float(np.median(ratio))
     scatter = 1.4826 * float(np.median(np.abs(ratio - rho))) * math.sqrt(CORRELATED_MEANS / len(ratio))
     by_mass = mass_std_kg / mass_kg * abs(float(np.median(thrust_n / mass_kg / normal)))
     return Balance(mass_kg, mass_std_kg, rho, math.hypot(math.hypot(scatter, by_mass), TILT_STD_RAD))
-
-
-def _mass(prior_kg: float, d_thrust: Array, d_force: Array, d_accel: Array) -> tuple[float, float]:
-    """Return the mass and its standard deviation: its prior, combined with an estimate by changes.
-
-    The mass is estimated by what changes from one mean to the next, with the changes of the acceleration a
-    as the instrument, ``m = sum(da dF) / sum(da df)``: a is the speed gained over each mean and known well,
-    while the attitude has the error of the body's tilt on rough terrain, which would bias m to low values.
-    """
-    prior_std_kg = prior_kg * MASS_STD_RATIO
-    covariation = float(d_accel @ d_force)
-    found_kg = float(d_accel @ d_thrust) / covariation if covariation > 0.0 else math.nan
-    # a robot that hardly changes its speed may come out at any mass, with a small error from few changes
-    if len(d_accel) < MIN_MEANS or not abs(found_kg - prior_kg) < MAX_MASS_STDS * prior_std_kg:
-        return prior_kg, prior_std_kg
-    residual = d_accel * (d_thrust - found_kg * d_force)
-    scatter_kg = math.sqrt(float(residual @ residual)) / covariation
-    found_std_kg = math.hypot(scatter_kg, THRUST_STD_RATIO * found_kg)
-    weight = prior_std_kg**2 / (prior_std_kg**2 + found_std_kg**2)
-    return prior_kg + weight * (found_kg - prior_kg), math.sqrt(weight) * found_std_kg
 
 
 SAMPLE_S = 0.2
@@ -432,22 +398,20 @@ def traction_samples(
     Means are taken before samples are sorted by slip: a single slip has the error of the ripple of Hall
     steps, and sorting by it would flatten a steep curve.
     """
-    rows = []
-    valid = forces.valid
+    rows, valid = [], forces.valid
     for i in range(valid.shape[1]):
         for part in valid_intervals(forces.time_s, valid[:, i] & where, SAMPLE_S):
-            load_n = float(forces.load_npkg[part, i].mean()) * mass_kg
-            n, last = part.stop - part.start, part.stop - 1
+            load_n, n = float(forces.load_npkg[part, i].mean()) * mass_kg, part.stop - part.start
             noise_std = wheel_speed_std_mps / (forces.reference_speed_mps[part, i].mean() * math.sqrt(n))
             mean_std = float(np.mean(forces.slip_std[part, i]))
-            change_n = abs(float(forces.thrust_n[last, i] - forces.thrust_n[part.start, i]))
+            thrust_n = forces.thrust_n[part, i]
             rows.append(
                 (
                     float(forces.slip_ratio[part, i].mean()),
                     math.hypot(noise_std, mean_std / math.sqrt(2.0)),
-                    float(forces.thrust_n[part, i].mean()) / load_n,
+                    float(thrust_n.mean()) / load_n,
                     forces.thrust_std_n / math.sqrt(n / 5.0) / load_n,
-                    LAG_S / SAMPLE_S * change_n / load_n,
+                    LAG_S / SAMPLE_S * abs(float(thrust_n[-1] - thrust_n[0])) / load_n,
                 )
             )
     return TractionSamples(*np.array(rows).reshape(-1, 5).T)

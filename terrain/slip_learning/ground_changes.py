@@ -18,7 +18,7 @@ from terrain.classify.changes import DetectorSettings, GroundChange, calibrate, 
 from terrain.errors import DataError
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
-from terrain.slip_learning.measured import MeasuredSlip, measured_slip, outside_source, wheel_speeds
+from terrain.slip_learning.measured import measured_slip, outside_source, wheel_speeds
 
 WINDOW_S, STRIDE_S = 0.5, 0.1
 
@@ -39,13 +39,9 @@ class SlipStep(NamedTuple):
     crossing_s: float
 
 
-def slip_step(run: RunLog, robot: Robot, delay_s: float = 0.0) -> SlipStep | None:
+def slip_step(run: RunLog, robot: Robot) -> SlipStep | None:
     """Return when the slip of a run changes; None where it does not, as measured from outside."""
-    return step_of(measured_slip(run, robot, window_s=WINDOW_S, stride_s=STRIDE_S, delay_s=delay_s), robot)
-
-
-def step_of(found: MeasuredSlip, robot: Robot) -> SlipStep | None:
-    """Return when the slip of short windows changes; None where it does not."""
+    found = measured_slip(run, robot, window_s=WINDOW_S, stride_s=STRIDE_S)
     known = np.isfinite(found.body_slip) & (found.start_s >= found.start_s[0] + SETTLING_S)
     slip, time_s = found.body_slip[known], found.time_s[known]
     n = slip.size
@@ -56,7 +52,7 @@ def step_of(found: MeasuredSlip, robot: Robot) -> SlipStep | None:
     before, after = sums[at - 1] / at, (sums[-1] - sums[at - 1]) / (n - at)
     best = int(np.argmax(at * (n - at) / n * (after - before) ** 2))
     j, one, other = int(at[best]), float(before[best]), float(after[best])
-    scatter = float(np.sqrt(np.mean(np.concatenate([slip[:j] - one, slip[j:] - other]) ** 2)))
+    scatter = float(np.sqrt(np.mean((slip - np.where(np.arange(n) < j, one, other)) ** 2)))
     if abs(other - one) < max(MIN_STEP, MIN_CLEAR * scatter):
         return None
     speed_mps = float(np.median(np.linalg.norm(found.twist[known, :2], axis=1)))
@@ -71,9 +67,8 @@ class WatchedRun:
     run_id: str  #: of the run
     changes: tuple[GroundChange, ...]  #: as they were found, in order of time
     judged: bool  #: whether the motion was measured from outside
-    step: (
-        SlipStep | None
-    )  #: of the slip measured from outside; None where it does not change, or nothing measured it
+    #: of the slip measured from outside; None where it does not change, or nothing measured it
+    step: SlipStep | None
     #: whether an alarm came while the robot crossed the border, or as long after; None without a step
     found: bool | None
     delay_s: float  #: of that alarm behind the middle of the crossing; NaN without one

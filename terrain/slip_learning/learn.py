@@ -15,8 +15,6 @@ from terrain.extension import correct
 from terrain.records import RunLog, TargetStatus
 from terrain.robots import Robot
 from terrain.slip_learning.curve import (
-    N_BOOTSTRAP,
-    Resistances,
     SlipCurve,
     Targets,
     contradiction,
@@ -101,34 +99,20 @@ def terrain_runs(run: RunLog, robot: Robot) -> list[TerrainRun]:
     return measured
 
 
-def learn_terrain(
-    terrain: str, runs: Sequence[TerrainRun], seed: int, n_bootstrap: int = N_BOOTSTRAP
-) -> LearnedTerrain:
+def learn_terrain(terrain: str, runs: Sequence[TerrainRun], seed: int) -> LearnedTerrain:
     """Return what runs show of one terrain; a curve is fitted only where they suffice for one."""
     with_bins = [run for run in runs if len(run.bins.slip_ratio)]
     bins = [run.bins for run in with_bins]
-    resistances = Resistances(
-        np.array([run.balance.resistance_ratio for run in with_bins]),
-        np.array([run.balance.resistance_std for run in with_bins]),
-    )
+    ratio, std = np.array([run.balance[2:] for run in with_bins]).reshape(-1, 2).T
     why = insufficiency(bins)
-    if why is None and not resistances.known.any():
+    if why is None and not np.isfinite(ratio + std).any():
         why = "no run has straight driving of sufficient length for an estimate of the resistance"
     if why is not None:
         return LearnedTerrain(terrain, tuple(runs), TargetStatus.UNESTIMATED, why)
-    curve = learn_curve(bins, resistances, np.random.default_rng(seed), n_bootstrap)
+    curve = learn_curve(bins, ratio, std, np.random.default_rng(seed))
     if (why := contradiction(curve)) is not None:
         return LearnedTerrain(terrain, tuple(runs), TargetStatus.INVALID, why, curve)
     return LearnedTerrain(terrain, tuple(runs), TargetStatus.ESTIMATED, "", curve, targets_of(curve))
-
-
-class LearnedRuns(NamedTuple):
-    """Runs that were measured, each on each of its terrains, what was learned, and a sentence for each run left out."""
-
-    used: list[RunLog]
-    measured: list[TerrainRun]
-    terrains: list[LearnedTerrain]
-    faulty: list[str]
 
 
 def learn_terrains(
@@ -138,7 +122,7 @@ def learn_terrains(
     *,
     skip_faulty: bool = False,
     progress: Callable[[str, int, int], None] = lambda task, done, total: None,
-) -> LearnedRuns:
+) -> tuple[list[RunLog], list[TerrainRun], list[LearnedTerrain], list[str]]:
     """Measure labelled runs and learn each terrain.
 
     Parameters
@@ -148,6 +132,13 @@ def learn_terrains(
     seed : of the bootstrap
     skip_faulty : leave out runs that lack something, in place of refusing them
     progress : gets the task, how many of its steps are done, and how many there are
+
+    Returns
+    -------
+    used : runs that were measured
+    measured : each on each of its terrains
+    learned : what was learned of each terrain
+    faulty : a sentence for each run left out
 
     Raises
     ------
@@ -173,4 +164,4 @@ def learn_terrains(
     for done, terrain in enumerate(terrains, start=1):
         learned.append(learn_terrain(terrain, [run for run in measured if run.terrain == terrain], seed))
         progress("learn", done, len(terrains))
-    return LearnedRuns(used, measured, learned, faulty)
+    return used, measured, learned, faulty

@@ -61,7 +61,7 @@ on one surface differ in how the robot was driven, and are no curve of thrust ov
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -72,9 +72,16 @@ from terrain.errors import ConfigError, DataError
 from terrain.kernels import njit
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
-from terrain.kinematics.wheels import TWIST, no_slip_twist, point_velocity, wheel_frame_velocities
+from terrain.kinematics.logged_wheels import speed_columns
+from terrain.kinematics.wheels import (
+    TWIST,
+    no_slip_twist,
+    point_velocity,
+    rolling_matrix,
+    wheel_frame_velocities,
+)
 from terrain.logs.schema import POSE_CHANNELS
-from terrain.records import Array, RunLog, SlipTrack, Stream, read_only
+from terrain.records import Array, RunLog, SlipTrack
 from terrain.robots import Robot, robot_named
 from terrain.signals import Delay, DelayStatus, common_delay
 from terrain.slip import slip_ratio
@@ -97,8 +104,7 @@ MAX_SPEED_RATIO, MAX_JUMP_M = 3.0, 0.05
 jumped; a robot that slides is not faster than its wheels were."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Travelled:
+class Travelled(NamedTuple):
     """Distances travelled forward and to the left, and the angle turned."""
 
     source: str  #: stream that measured it
@@ -107,10 +113,6 @@ class Travelled:
     part: Array  #: (n,) number of the part that a sample is in; distances of two parts are not related
     n_jumps: int  #: n_jumps, n_gaps: why parts begin
     n_gaps: int
-
-    def __post_init__(self) -> None:
-        for name, dtype in (("time_s", float), ("values", float), ("part", np.int64)):
-            object.__setattr__(self, name, read_only(getattr(self, name), dtype))
 
 
 def outside_source(run: RunLog) -> str | None:
@@ -153,102 +155,75 @@ def travelled(run: RunLog, robot: Robot, delay_s: float = 0.0) -> Travelled:
             f"run {run.run_id}: nothing measured the motion from outside; a stream "
             f"{', '.join(list(SOURCES)[:-1])} or {list(SOURCES)[-1]} is needed"
         )
-    stream = run.streams[name]
-    if name == "pose":
-        found = _of_poses(stream, _fastest_mps(run, robot))
-    elif name == "gnss":
-        found = _of_twists(name, _receiver_twist(run, robot))
+    stream, by_pose = run.streams[name], name == "pose"
+    usual_s = float(np.median(np.diff(stream.time_s)))
+    values = (
+        np.column_stack([stream.channel(channel) for channel in POSE_CHANNELS])
+        if by_pose
+        else _twists(run, robot, name)
+    )
+    known = np.isfinite(values).all(axis=1)
+    time_s, values = stream.time_s[known], values[known]
+    if len(time_s) < 2:
+        return Travelled(name, time_s, np.zeros((len(time_s), 3)), np.zeros(len(time_s), np.int64), 0, 0)
+    step_s = np.diff(time_s)
+    if by_pose:
+        yaw = np.unwrap(values[:, 2])
+        turned, chord = np.diff(yaw), np.diff(values[:, :2], axis=0)
+        heading = yaw[:-1] + turned / 2
+        cos, sin = np.cos(heading), np.sin(heading)
+        x, y = (chord / np.sinc(turned / (2 * np.pi))[:, None]).T
+        steps, gap = np.column_stack([cos * x + sin * y, cos * y - sin * x, turned]), step_s > MAX_GAP_S
+        far_m = MAX_SPEED_RATIO * _fastest_mps(run, robot) * step_s + MAX_JUMP_M
+        jumped = ~gap & (np.linalg.norm(chord, axis=1) > far_m)
     else:
-        found = _of_twists(name, _twist_stream(stream, robot))
-    return found if delay_s == 0.0 else replace(found, time_s=found.time_s - delay_s)
+        steps, gap = step_s[:, None] * (values[1:] + values[:-1]) / 2.0, step_s > max(1.5 * usual_s, 1e-3)
+        jumped = np.zeros(len(gap), dtype=bool)
+    broken = gap | jumped
+    part = np.concatenate([[0], np.cumsum(broken)]).astype(np.int64)
+    sums = np.concatenate([np.zeros((1, 3)), np.cumsum(np.where(broken[:, None], 0.0, steps), axis=0)])
+    return Travelled(name, time_s - delay_s, sums, part, int(jumped.sum()), int(gap.sum()))
 
 
 def _fastest_mps(run: RunLog, robot: Robot) -> float:
     """Return the speed of the fastest wheel; infinite where no wheel is known."""
-    wheels = run.streams.get("wheels")
-    if wheels is None:
+    if (wheels := run.streams.get("wheels")) is None:
         return float("inf")
-    scales = {"speed": 1.0}
-    if robot.describes("motors"):
-        scales["motor"] = robot.wheel_radius_m / robot.motors.reduction_ratio
-    for quantity, scale in scales.items():
-        columns = [wheels.channel(c) for c in wheels.channels if c.startswith(f"{quantity}_")]
-        values = np.column_stack(columns) if columns else np.empty(0)
-        known = np.abs(values[np.isfinite(values)])
-        if known.size:
-            return float(known.max()) * scale
-    return float("inf")
+    columns, scale = speed_columns(wheels.channels, robot)
+    speeds = np.abs(wheels.values[:, columns])
+    return float(speeds[np.isfinite(speeds)].max(initial=0.0)) * scale or float("inf")
 
 
-def _of_poses(stream: Stream, fastest_mps: float) -> Travelled:
-    pose = np.column_stack([stream.channel(channel) for channel in POSE_CHANNELS])
-    known = np.isfinite(pose).all(axis=1)
-    time_s, pose = stream.time_s[known], pose[known]
-    if len(time_s) < 2:
-        return Travelled("pose", time_s, np.zeros((len(time_s), 3)), np.zeros(len(time_s)), 0, 0)
-    yaw = np.unwrap(pose[:, 2])
-    turned, chord, step_s = np.diff(yaw), np.diff(pose[:, :2], axis=0), np.diff(time_s)
-    heading = yaw[:-1] + turned / 2
-    cos, sin = np.cos(heading), np.sin(heading)
-    arc = chord / np.sinc(turned / (2 * np.pi))[:, None]
-    steps = np.column_stack([cos * arc[:, 0] + sin * arc[:, 1], cos * arc[:, 1] - sin * arc[:, 0], turned])
-    gap = step_s > MAX_GAP_S
-    jumped = ~gap & (np.linalg.norm(chord, axis=1) > MAX_SPEED_RATIO * fastest_mps * step_s + MAX_JUMP_M)
-    return _summed("pose", time_s, steps, gap, jumped)
-
-
-def _of_twists(name: str, stream: Stream) -> Travelled:
-    known = np.isfinite(stream.values).all(axis=1)
-    time_s, twist = stream.time_s[known], stream.values[known]
-    usual_s = float(np.median(np.diff(stream.time_s)))
-    steps = np.diff(time_s)[:, None] * (twist[1:] + twist[:-1]) / 2.0
-    return _summed(
-        name, time_s, steps, np.diff(time_s) > max(1.5 * usual_s, 1e-3), np.zeros(len(steps), dtype=bool)
-    )
-
-
-def _summed(name: str, time_s: Array, steps: Array, gap: Array, jumped: Array) -> Travelled:
-    broken = gap | jumped
-    part = np.concatenate([[0], np.cumsum(broken)])
-    values = np.concatenate([np.zeros((1, 3)), np.cumsum(np.where(broken[:, None], 0.0, steps), axis=0)])
-    return Travelled(name, time_s, values, part, int(jumped.sum()), int(gap.sum()))
-
-
-def _receiver_twist(run: RunLog, robot: Robot) -> Stream:
-    """Return the twist of a body that moves along its x axis, by a receiver's velocity and the gyro."""
-    if robot.sideways:
-        raise DataError(
-            f"run {run.run_id}: the velocity of its receiver has no heading, and robot {robot.name} can "
-            "drive sideways; poses are needed"
-        )
-    gnss, imu = run.streams["gnss"], run.streams.get("imu")
-    speed_mps = np.hypot(*(gnss.channel(name) for name in VELOCITY))
-    wheels = run.streams.get("wheels")
-    if wheels is not None:
-        speeds = [wheels.channel(c) for c in wheels.channels if c.startswith("speed_")]
-        if speeds:
-            speed_mps = speed_mps * np.sign(np.interp(gnss.time_s, wheels.time_s, np.mean(speeds, axis=0)))
-    turn_radps = np.zeros(len(gnss))
-    if imu is not None and "gyro_z_radps" in imu.channels:
-        gyro = imu.channel("gyro_z_radps")
-        known = np.isfinite(gyro)
-        turn_radps = np.interp(gnss.time_s, imu.time_s[known], gyro[known]) if known.any() else turn_radps
-    return Stream(gnss.time_s, np.column_stack([speed_mps, np.zeros(len(gnss)), turn_radps]), TWIST)
-
-
-def _twist_stream(stream: Stream, robot: Robot) -> Stream:
-    """Return the twist of the body's origin."""
+def _twists(run: RunLog, robot: Robot, name: str) -> Array:
+    """Return the twists (n, 3) of the body's origin by a stream of speeds."""
+    stream, still = run.streams[name], np.zeros(len(run.streams[name]))
+    if name == "gnss":  # of a body that moves along its x axis, by a receiver's velocity and the gyro
+        if robot.sideways:
+            raise DataError(
+                f"run {run.run_id}: the velocity of its receiver has no heading, and robot {robot.name} can "
+                "drive sideways; poses are needed"
+            )
+        wheels, imu, turn = run.streams.get("wheels"), run.streams.get("imu"), still
+        ahead = np.hypot(*(stream.channel(channel) for channel in VELOCITY))
+        names = [] if wheels is None else [c for c in wheels.channels if c.startswith("speed_")]
+        if wheels is not None and names:
+            rolled = np.mean([wheels.channel(channel) for channel in names], axis=0)
+            ahead = ahead * np.sign(np.interp(stream.time_s, wheels.time_s, rolled))
+        if imu is not None and "gyro_z_radps" in imu.channels:
+            gyro = imu.channel("gyro_z_radps")
+            known = np.isfinite(gyro)
+            turn = np.interp(stream.time_s, imu.time_s[known], gyro[known]) if known.any() else still
+        return np.column_stack([ahead, still, turn])
     if set(TWIST) <= set(stream.channels):
-        return Stream(stream.time_s, np.column_stack([stream.channel(name) for name in TWIST]), TWIST)
+        return np.column_stack([stream.channel(channel) for channel in TWIST])
     camera = robot.completed.camera
     if set(CAMERA_CHANNELS[:-1]) <= set(stream.channels):
         seen = body_motion(stream, camera)
-        ahead_mps, left_mps, turn_radps = *seen.speed_mps.T, seen.yaw_rate_radps
+        ahead, left, turn = *seen.speed_mps.T, seen.yaw_rate_radps
     else:  # a speed alone: the point that it is of turns with the body by a rate that is not measured
-        ahead_mps, left_mps = (stream.channel(name) for name in TWIST[:2])
-        turn_radps = np.zeros(len(stream))
-    origin = point_velocity(ahead_mps, left_mps, turn_radps, -camera.lever_x_m, -camera.lever_y_m)
-    return Stream(stream.time_s, np.column_stack([*origin, turn_radps]), TWIST)
+        ahead, left, turn = *(stream.channel(channel) for channel in TWIST[:2]), still
+    origin = point_velocity(ahead, left, turn, -camera.lever_x_m, -camera.lever_y_m)
+    return np.column_stack([*origin, turn])
 
 
 MAX_CORRELATION = 0.95  #: Of residuals; beyond, too few independent samples are left for a variance
@@ -322,8 +297,7 @@ MIN_SAMPLES = 6
 COVERAGE = 0.8  #: Of a window, by samples of either stream
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasuredSlip:
+class MeasuredSlip(NamedTuple):
     """Slip over k windows of a run; NaN where it is not known."""
 
     run_id: str  #: of the run
@@ -345,12 +319,6 @@ class MeasuredSlip:
     steady: Array  #: (k,) whether both halves of a window have one speed
     n_jumps: int = 0  #: n_jumps, n_gaps: of the outside measurement
     n_gaps: int = 0
-
-    def __post_init__(self) -> None:
-        for name in self.__slots__:
-            value = getattr(self, name)
-            if isinstance(value, np.ndarray):
-                object.__setattr__(self, name, read_only(value, value.dtype))
 
     @property
     def time_s(self) -> Array:
@@ -375,7 +343,6 @@ def measured_slip(
     window_s: float = WINDOW_S,
     stride_s: float = STRIDE_S,
     delay_s: float = 0.0,
-    min_speed_mps: float = MIN_SPEED_MPS,
     whole: bool = False,
 ) -> MeasuredSlip:
     """Return the slip of a run over windows, from wheel speeds and a measurement from outside.
@@ -386,7 +353,6 @@ def measured_slip(
     robot : whose log it is, of any drive
     window_s, stride_s : length of the windows, and from one to the next
     delay_s : of the outside measurement behind the wheels
-    min_speed_mps : slower, in wheel speed and ground speed alike, a wheel or body is standing: no slip
     whole : windows over all that the wheels were logged, NaN where the motion was not measured; by default
         they begin and end where both were
 
@@ -401,19 +367,40 @@ def measured_slip(
         raise ConfigError(f"window and stride are {window_s:g} and {stride_s:g} s, lengths above zero needed")
     time_s, speeds = wheel_speeds(run, robot)
     path = travelled(run, robot, delay_s)
-    start_s = _starts(run.run_id, time_s, time_s if whole else path.time_s, window_s, stride_s)
-    end_s = start_s + window_s
-    wheels = _WheelSums(time_s, speeds)
-    u, u_std = wheels.rates(start_s, end_s)
-    twist, twist_std = window_rates(
-        path.time_s, path.values, path.part, start_s, end_s, MIN_SAMPLES, COVERAGE
-    )
-    direction = wheel_directions(run, robot, start_s, end_s)
-    along, _ = wheel_frame_velocities(twist, robot.wheel_positions_m, direction)
-    along_std = _along_std(twist_std, robot.wheel_positions_m, direction)
-    slip, slip_std = _slip(u, u_std, along, along_std, min_speed_mps)
-    rolled_twist, _ = no_slip_twist(robot.wheel_positions_m, direction, u, robot.on_omni_wheels)
-    body_slip, body_std, side = _body(rolled_twist, u_std, twist, twist_std, min_speed_mps)
+    outside_s = time_s if whole else path.time_s
+    if len(outside_s) < 2:
+        raise DataError(
+            f"run {run.run_id}: has {len(outside_s)} samples measured from outside, two are needed"
+        )
+    begin_s, last_s = max(time_s[0], outside_s[0]), min(time_s[-1], outside_s[-1]) - window_s
+    if last_s < begin_s - 0.02 * window_s:
+        raise DataError(
+            f"run {run.run_id}: wheels and outside measurement share {max(last_s + window_s - begin_s, 0.0):.2f} "
+            f"s, a window takes {window_s:g} s"
+        )
+    n = max(int(np.floor((last_s - begin_s) / stride_s + 1e-6)) + 1, 1)
+    start_s = begin_s + stride_s * np.arange(n)
+    end_s, rolled, enough = start_s + window_s, _rolled(time_s, speeds), (MIN_SAMPLES, COVERAGE)
+    u, u_std = window_rates(*rolled, start_s, end_s, *enough)
+    twist, twist_std = window_rates(path.time_s, path.values, path.part, start_s, end_s, *enough)
+    place_m, direction = robot.wheel_positions_m, wheel_directions(run, robot, start_s, end_s)
+    along, _ = wheel_frame_velocities(twist, place_m, direction)
+    along_std = np.sqrt(((rolling_matrix(place_m, direction) * twist_std[:, None, :]) ** 2).sum(axis=-1))
+    slip, slip_std = _slip(u, u_std, along, along_std)
+    rolled_twist, _ = no_slip_twist(place_m, direction, u, robot.on_omni_wheels)
+    speed = np.linalg.norm(rolled_twist[:, :2], axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ahead = rolled_twist[:, :2] / speed[:, None]
+    body = (twist[:, :2] * ahead).sum(axis=1)
+    body_std = np.sqrt(((ahead * twist_std[:, :2]) ** 2).sum(axis=1))
+    body_slip, body_slip_std = _slip(speed, np.sqrt((u_std**2).mean(axis=1)), body, body_std)
+    across = ahead[:, 0] * twist[:, 1] - ahead[:, 1] * twist[:, 0]
+    side = np.where(np.isnan(body_slip), np.nan, across / np.maximum(speed, np.abs(body)))
+    middle_s = (start_s + end_s) / 2
+    first, first_std = window_rates(*rolled, start_s, middle_s, *enough)
+    second, second_std = window_rates(*rolled, middle_s, end_s, *enough)
+    least = STEADY_RATIO * np.abs(u).max(axis=1, keepdims=True)
+    allowed = np.maximum(least, STEADY_STD * np.hypot(first_std, second_std))
     return MeasuredSlip(
         run_id=run.run_id,
         source=path.source,
@@ -428,38 +415,20 @@ def measured_slip(
         twist_std=twist_std,
         rolled_twist=rolled_twist,
         body_slip=body_slip,
-        body_slip_std=body_std,
+        body_slip_std=body_slip_std,
         body_side=side,
-        steady=wheels.steady(start_s, end_s, u),
+        steady=(np.abs(second - first) <= allowed).all(axis=1),
         n_jumps=path.n_jumps,
         n_gaps=path.n_gaps,
     )
 
 
-class _WheelSums:
-    """What wheels rolled up to each sample."""
-
-    def __init__(self, time_s: Array, speeds_mps: Array) -> None:
-        steps = np.diff(time_s)[:, None] * (speeds_mps[1:] + speeds_mps[:-1]) / 2
-        rolled = np.concatenate([np.zeros((1, speeds_mps.shape[1])), np.cumsum(steps, axis=0)])
-        known = np.isfinite(rolled).all(axis=1)
-        self._sums = time_s[known], rolled[known], np.zeros(int(known.sum()), dtype=np.int64)
-
-    def rates(
-        self, start_s: Array, end_s: Array, min_samples: int = MIN_SAMPLES, coverage: float = COVERAGE
-    ) -> tuple[Array, Array]:
-        """Return mean speeds (k, wheels) over windows, and their standard deviations."""
-        rate, std = window_rates(*self._sums, start_s, end_s, min_samples, coverage)
-        return rate, std
-
-    def steady(self, start_s: Array, end_s: Array, speed_mps: Array) -> Array:
-        """Return whether (k,) both halves of a window have the speed of the whole."""
-        middle_s = (start_s + end_s) / 2
-        first, first_std = self.rates(start_s, middle_s)
-        second, second_std = self.rates(middle_s, end_s)
-        least = STEADY_RATIO * np.abs(speed_mps).max(axis=1, keepdims=True)
-        allowed = np.maximum(least, STEADY_STD * np.hypot(first_std, second_std))
-        return np.asarray((np.abs(second - first) <= allowed).all(axis=1))
+def _rolled(time_s: Array, speeds_mps: Array) -> tuple[Array, Array, Array]:
+    """Return stamps, what wheels rolled up to each, and the one part that they are of."""
+    steps = np.diff(time_s)[:, None] * (speeds_mps[1:] + speeds_mps[:-1]) / 2
+    rolled = np.concatenate([np.zeros((1, speeds_mps.shape[1])), np.cumsum(steps, axis=0)])
+    known = np.isfinite(rolled).all(axis=1)
+    return time_s[known], rolled[known], np.zeros(int(known.sum()), dtype=np.int64)
 
 
 def wheel_speeds(run: RunLog, robot: Robot) -> tuple[Array, Array]:
@@ -502,57 +471,23 @@ def wheel_directions(run: RunLog, robot: Robot, start_s: Array, end_s: Array) ->
     return means
 
 
-def spinning_wheels(found: MeasuredSlip, spin_ratio: float = 0.9, others_ratio: float = 0.5) -> Sequence[str]:
-    """Return the wheels that spin or lift in any window: nearly all their speed is slip, others grip.
-
-    Parameters
-    ----------
-    found : of a run
-    spin_ratio : slip of a wheel that spins; below minus that it is locked
-    others_ratio : slip that the others stay below, in magnitude
-
-    Examples
-    --------
-    A wheel of four that turns in the air is named in ``terrain estimate --filter pose``.
-    """
-    names = []
-    magnitude = np.abs(found.slip_ratio)
-    for i, wheel in enumerate(found.wheels):
-        others = np.delete(magnitude, i, axis=1)
-        with np.errstate(invalid="ignore"):
-            alone = (magnitude[:, i] > spin_ratio) & (others < others_ratio).any(axis=1)
-            certain = found.slip_std[:, i] < 1.0 - spin_ratio
-        if (alone & certain).any():
-            names.append(wheel)
-    return names
+SPIN_RATIO, GRIP_RATIO = 0.9, 0.5  #: Slip of a wheel that spins, and that one of the others stays below.
 
 
-def _starts(run_id: str, wheels_s: Array, outside_s: Array, window_s: float, stride_s: float) -> Array:
-    if len(outside_s) < 2:
-        raise DataError(f"run {run_id}: has {len(outside_s)} samples measured from outside, two are needed")
-    begin_s = max(float(wheels_s[0]), float(outside_s[0]))
-    last_s = min(float(wheels_s[-1]), float(outside_s[-1])) - window_s
-    if last_s < begin_s - 0.02 * window_s:
-        raise DataError(
-            f"run {run_id}: wheels and outside measurement share {max(last_s + window_s - begin_s, 0.0):.2f} "
-            f"s, a window takes {window_s:g} s"
-        )
-    n = int(np.floor((last_s - begin_s) / stride_s + 1e-6)) + 1
-    return begin_s + stride_s * np.arange(max(n, 1))
+def spinning_wheels(found: MeasuredSlip) -> list[str]:
+    """Return the wheels that spin or lift in any window: nearly all their speed is slip, others grip."""
+    with np.errstate(invalid="ignore"):
+        magnitude = np.abs(found.slip_ratio)
+        grips = magnitude < GRIP_RATIO
+        others = grips.sum(axis=1, keepdims=True) > grips
+        alone = (magnitude > SPIN_RATIO) & others & (found.slip_std < 1.0 - SPIN_RATIO)
+    return [wheel for wheel, spins in zip(found.wheels, alone.any(axis=0), strict=True) if spins]
 
 
-def _along_std(twist_std: Array, positions_m: Array, direction_rad: Array) -> Array:
-    """Return the standard deviation (k, wheels) of the speed along each wheel."""
-    x_m, y_m = positions_m.T
-    cos, sin = np.cos(direction_rad), np.sin(direction_rad)
-    slopes = np.stack([cos, sin, x_m * sin - y_m * cos], axis=-1)
-    return np.asarray(np.sqrt(((slopes * twist_std[:, None, :]) ** 2).sum(axis=-1)))
-
-
-def _slip(u: Array, u_std: Array, v: Array, v_std: Array, min_speed_mps: float) -> tuple[Array, Array]:
+def _slip(u: Array, u_std: Array, v: Array, v_std: Array) -> tuple[Array, Array]:
     """Return slip and its standard deviation; NaN where standing or too uncertain."""
-    slip = slip_ratio(u, v, min_speed_mps)
-    fastest = np.maximum(np.maximum(np.abs(u), np.abs(v)), min_speed_mps)
+    slip = slip_ratio(u, v, MIN_SPEED_MPS)
+    fastest = np.maximum(np.maximum(np.abs(u), np.abs(v)), MIN_SPEED_MPS)
     slower = np.minimum(np.abs(u), np.abs(v))
     driven = np.abs(u) >= np.abs(v)
     by_fastest, by_slowest = slower / fastest**2, 1.0 / fastest
@@ -561,21 +496,6 @@ def _slip(u: Array, u_std: Array, v: Array, v_std: Array, min_speed_mps: float) 
     )
     unknown = np.isnan(slip) | ~(std <= MAX_SLIP_STD)
     return np.where(unknown, np.nan, slip), np.where(unknown, np.nan, std)
-
-
-def _body(
-    rolled: Array, u_std: Array, twist: Array, twist_std: Array, min_speed_mps: float
-) -> tuple[Array, Array, Array]:
-    """Return slip of the body, its standard deviation, and the speed off course over the larger speed."""
-    speed = np.linalg.norm(rolled[:, :2], axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ahead = rolled[:, :2] / speed[:, None]
-    along = (twist[:, :2] * ahead).sum(axis=1)
-    across = ahead[:, 0] * twist[:, 1] - ahead[:, 1] * twist[:, 0]
-    along_std = np.sqrt(((ahead * twist_std[:, :2]) ** 2).sum(axis=1))
-    speed_std = np.sqrt((u_std**2).mean(axis=1))
-    slip, std = _slip(speed, speed_std, along, along_std, min_speed_mps)
-    return slip, std, np.where(np.isnan(slip), np.nan, across / np.maximum(speed, np.abs(along)))
 
 
 DELAY_SEARCH_S = (-0.4, 1.2)
@@ -624,26 +544,26 @@ def estimate_delay(runs: Sequence[RunLog], robot: Robot, seed: int = 0) -> Delay
 def _misfits(run: RunLog, robot: Robot, lags_s: Array, n_parts: int) -> list[Array]:
     """Return the misfit (lags,) of each part of a run, relative to what its wheels vary by."""
     time_s, speeds = wheel_speeds(run, robot)
-    path = travelled(run, robot)
-    if len(path.time_s) < 2:
+    _, times_s, values, part, *_ = travelled(run, robot)
+    if len(times_s) < 2:
         return []
     if not np.abs(speeds[0]).max() > 0.0:
         rest_s = np.arange(-REST_S, -DELAY_STEP_S / 2, DELAY_STEP_S)
-        time_s, speeds = np.r_[time_s[0] + rest_s, time_s], np.pad(speeds, ((rest_s.size, 0), (0, 0)))
-        before = np.r_[np.zeros(rest_s.size, int), np.arange(len(path.time_s))]
-        times_s = np.r_[path.time_s[0] + rest_s, path.time_s]
-        path = replace(path, time_s=times_s, values=path.values[before], part=path.part[before])
+        time_s, times_s = np.r_[time_s[0] + rest_s, time_s], np.r_[times_s[0] + rest_s, times_s]
+        speeds, values = (np.pad(each, ((rest_s.size, 0), (0, 0)), mode="edge") for each in (speeds, values))
+        part = np.pad(part, (rest_s.size, 0), mode="edge")
     start_s = np.arange(time_s[0], time_s[-1] - DELAY_WINDOW_S, DELAY_WINDOW_S / 6)
     if start_s.size < 8 * n_parts:
         return []
     end_s = start_s + DELAY_WINDOW_S
-    u, _ = _WheelSums(time_s, speeds).rates(start_s, end_s, 3, 0.4)
+    u, _ = window_rates(*_rolled(time_s, speeds), start_s, end_s, 3, 0.4)
     directions = wheel_directions(run, robot, start_s, end_s)
     rolled, _ = no_slip_twist(robot.wheel_positions_m, directions, u, robot.on_omni_wheels)
     scale = np.array([1.0, 1.0, float(np.linalg.norm(robot.wheel_positions_m, axis=1).max())])
-    sums = path.time_s, path.values, path.part
-    seen = np.array([window_rates(*sums, start_s + lag_s, end_s + lag_s, 3, 0.4)[0] for lag_s in lags_s])
-    x, y = rolled * scale, seen * scale
+    rates = (
+        window_rates(times_s, values, part, start_s + lag_s, end_s + lag_s, 3, 0.4)[0] for lag_s in lags_s
+    )
+    x, y = rolled * scale, np.array(list(rates)) * scale
     known = np.isfinite(x).all(axis=1) & np.isfinite(y).all(axis=2)
     curves = []
     for rows in np.array_split(np.arange(start_s.size), n_parts):

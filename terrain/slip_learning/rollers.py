@@ -26,9 +26,10 @@ import numpy as np
 
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.errors import DataError
-from terrain.identify import Fit, Parameter, folds, identify
+from terrain.identify import Parameter, folds, identify
 from terrain.records import Array
 from terrain.robots import OmniRobot, Robot, as_drive
+from terrain.signals import agreement
 from terrain.simulation.plants.planar import steady_twist
 from terrain.slip_learning.measured import Measured, MeasuredSlip, single_terrain
 
@@ -37,7 +38,14 @@ N_FOLDS = 5
 MIN_RUNS = 10
 """Of a surface: two unknowns of the load, the scale and its own friction over several directions."""
 
-_FREE = -7.0  #: Logarithm of a roller ratio that counts as none: 0.001
+#: Loads of the first and last wheel over that of the second, and kappa.
+ROBOT = (
+    *(Parameter(f"load_{i}_ratio", 1.0, 0.05, 20.0) for i in (1, 3)),
+    Parameter("scale_ratio", 0.03, -0.3, 0.6),
+)
+SURFACE = Parameter(
+    "log_roller_ratio", -1.0, -7.0, 3.0
+)  #: Of each surface; from 0.001, which counts as none.
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,17 +94,23 @@ class RollerFindings:
         return found
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Cases:
-    """Median wheel speeds (n, wheels), slip and sideways speed (n,) of runs, and the group of each."""
+def loads_of(values: Array) -> Array:
+    """Return the share of the weight on each wheel (3,) by the parameters."""
+    share = np.array([values[0], 1.0, values[1]])
+    return np.asarray(share / share.sum())
 
-    wheel_speed_mps: Array
-    slip: Array
-    side: Array
-    group: Array
 
-    def at(self, rows: Array) -> _Cases:
-        return _Cases(self.wheel_speed_mps[rows], self.slip[rows], self.side[rows], self.group[rows])
+def law_motion(
+    robot: Robot, wheel_speed_mps: Array, loads: Array, roller_ratio: float, kappa: float
+) -> Array:
+    """Return slip and sideways speed (n, 2) of the law at speeds (n, 3) of the wheels."""
+    place = robot.wheel_positions_m, robot.wheel_directions_rad
+    twist = steady_twist(wheel_speed_mps, *place, loads, roller_ratio, kappa)
+    free = steady_twist(wheel_speed_mps, *place, np.full(3, 1 / 3), 0.0)
+    speed = np.linalg.norm(free[:, :2], axis=1)
+    ahead = free[:, :2] / speed[:, None]
+    side = (ahead[:, 0] * twist[:, 1] - ahead[:, 1] * twist[:, 0]) / speed
+    return np.column_stack([1.0 - (twist[:, :2] * ahead).sum(axis=1) / speed, side])
 
 
 def roller_findings(
@@ -116,32 +130,56 @@ def roller_findings(
     DataError
         if a surface has fewer than :data:`MIN_RUNS` runs, or none is fitted.
     """
-    cases = _cases(runs, groups)
-    names = list(surfaces)
+    chosen = [(run, group) for run, group in zip(runs, groups, strict=True) if run.known.size]
+    speeds = np.array([np.median(run.wheel_speed_mps[run.known], axis=0) for run, _ in chosen])
+    seen = np.array(
+        [[np.median(run.body_slip[run.known]), np.median(run.body_side[run.known])] for run, _ in chosen]
+    )
+    group, names = np.array([group for _, group in chosen]), list(surfaces)
     for name in names:
-        if (n := int((cases.group == name).sum())) < MIN_RUNS:
+        if (n := int((group == name).sum())) < MIN_RUNS:
             raise DataError(f"surface {name!r} has {n} runs in steady motion; {MIN_RUNS} are needed")
     if not names:
         raise DataError("no surface is named whose runs could be fitted")
-    fitted = cases.at(np.flatnonzero(np.isin(cases.group, names)))
-    law = _Law(robot, names)
-    fit = law.fit(fitted, np.arange(len(fitted.slip)))
-    fold, left = np.empty(len(fitted.slip), int), np.empty(len(fitted.slip))
-    places = [np.flatnonzero(fitted.group == name) for name in names]
-    for rows in places:
-        fold[rows] = np.arange(len(rows)) % N_FOLDS
-    for train, test in folds(fold):
-        part = law.fit(fitted.at(train)).value
-        left[test] = law.motion(fitted.at(test), part)[0] - fitted.slip[test]
-    loads, load_interval = fit.derived(law.loads)
+
+    def misfit(rows: Array, values: Array, surface: str = "") -> Array:
+        """Return what the law leaves of some runs (n, 2), on their own surfaces or all on one."""
+        out = np.empty((len(rows), 2))
+        for i, name in enumerate(names):
+            own = (group[rows] == name) if not surface else np.full(len(rows), name == surface)
+            law = loads_of(values), float(np.exp(values[3 + i])), float(values[2])
+            out[own] = law_motion(robot, speeds[rows][own], *law) - seen[rows][own]
+        return out
+
+    parameters = [*ROBOT, *(SURFACE._replace(name=f"log_roller_{name}_ratio") for name in names)]
+    fitted = np.flatnonzero(np.isin(group, names))
+    fit = identify(partial(misfit, fitted), parameters, np.arange(len(fitted)))
+    fold, left = np.zeros(len(group), int), np.empty(len(group))
+    places = {name: np.flatnonzero(group == name) for name in dict.fromkeys(group.tolist())}
+    for name in names:
+        fold[places[name]] = np.arange(len(places[name])) % N_FOLDS
+    for train, test in folds(fold[fitted]):
+        part = identify(partial(misfit, fitted[train]), parameters).value
+        left[fitted[test]] = misfit(fitted[test], part)[:, 0]
+    loads, load_interval = fit.derived(loads_of)
     ratios, ratio_interval = fit.derived(lambda values: np.exp(values[3:]))
-    intervals = [(max(low, 0.0), high) for low, high in ratio_interval.T.tolist()]
-    others = [name for name in dict.fromkeys(cases.group.tolist()) if name not in names]
-    found = {
-        name: law.other_load(cases.at(np.flatnonzero(cases.group == name)), fit.value) for name in others
-    }
-    named = {name: each for name, each in found.items() if each is not None}
+    other_surface: dict[str, str] = {}
+    other_loads: dict[str, tuple[float, ...]] = {}
+    other_rms: dict[str, tuple[float, float]] = {}
+    for name, rows in places.items():
+        if name in names or len(rows) < MIN_RUNS:
+            continue
+        before = {surface: _rms(misfit(rows, fit.value, surface)) for surface in names}
+        other_surface[name] = surface = min(before, key=before.__getitem__)
+        own = identify(
+            lambda two: misfit(rows, np.concatenate([two, fit.value[2:]]), surface),  # noqa: B023
+            ROBOT[:2],
+            starts=[fit.value[:2]],
+        )
+        other_loads[name] = tuple(loads_of(own.value).tolist())
+        other_rms[name] = before[surface], _rms(own.residual)
     low, high = fit.interval[:, 2].tolist()
+    intervals = [(max(low, 0.0), high) for low, high in ratio_interval.T.tolist()]
     return RollerFindings(
         load_ratio=tuple(loads.tolist()),
         load_interval=tuple((low, high) for low, high in load_interval.T.tolist()),
@@ -149,103 +187,29 @@ def roller_findings(
         scale_interval=(low, high),
         roller_ratio=dict(zip(names, ratios.tolist(), strict=True)),
         roller_interval=dict(zip(names, intervals, strict=True)),
-        held_out_rms={name: _rms(left[rows]) for name, rows in zip(names, places, strict=True)},
-        plain_rms={name: float(fitted.slip[rows].std()) for name, rows in zip(names, places, strict=True)},
-        other_surface={name: surface for name, (surface, _, _) in named.items()},
-        other_loads={name: loads for name, (_, loads, _) in named.items()},
-        other_rms={name: rms for name, (_, _, rms) in named.items()},
+        held_out_rms={name: _rms(left[places[name]]) for name in names},
+        plain_rms={name: float(seen[places[name], 0].std()) for name in names},
+        other_surface=other_surface,
+        other_loads=other_loads,
+        other_rms=other_rms,
     )
-
-
-def surface_of_windows(slip: MeasuredSlip, found: RollerFindings, robot: Robot) -> list[str]:
-    """Return the surface whose rollers explain each window of a run best; empty where it is not steady."""
-    names = list(found.roller_ratio)
-    rows = np.flatnonzero(slip.steady & np.isfinite(slip.body_slip) & np.isfinite(slip.body_side))
-    windows = _Cases(
-        slip.wheel_speed_mps[rows], slip.body_slip[rows], slip.body_side[rows], np.full(len(rows), "")
-    )
-    law, load = _Law(robot, names), found.load_ratio
-    rho = np.log(np.maximum([found.roller_ratio[name] for name in names], 1e-6))
-    parameters = np.concatenate([[load[0] / load[1], load[2] / load[1], found.scale_error], rho])
-    off = np.empty((len(names), len(rows)))
-    for i, name in enumerate(names):
-        of_slip, side = law.motion(windows, parameters, name)
-        off[i] = np.hypot(of_slip - windows.slip, side - windows.side)
-    named = [""] * len(slip.steady)
-    for row, best in zip(rows.tolist(), off.argmin(axis=0).tolist(), strict=True):
-        named[row] = names[best]
-    return named
-
-
-class _Law:
-    """The law with its parameters: loads of the first and last wheel over the second, kappa, log rho."""
-
-    def __init__(self, robot: Robot, surfaces: Sequence[str]) -> None:
-        self.robot, self.surfaces = robot, list(surfaces)
-        loads = [Parameter(f"load_{i}_ratio", 1.0, 0.05, 20.0) for i in (1, 3)]
-        rollers = [Parameter(f"log_roller_{name}_ratio", -1.0, _FREE, 3.0) for name in surfaces]
-        self.parameters = [*loads, Parameter("scale_ratio", 0.03, -0.3, 0.6), *rollers]
-
-    def loads(self, parameters: Array) -> Array:
-        share = np.array([parameters[0], 1.0, parameters[1]])
-        return np.asarray(share / share.sum())
-
-    def motion(self, cases: _Cases, parameters: Array, group: str = "") -> tuple[Array, Array]:
-        """Return the slip (n,) and sideways speed (n,) of the law."""
-        slip, side = np.empty(len(cases.slip)), np.empty(len(cases.slip))
-        for i, name in enumerate(self.surfaces):
-            rows = np.flatnonzero(cases.group == name) if not group else np.arange(len(slip))
-            if group and name != group:
-                continue
-            speeds = cases.wheel_speed_mps[rows]
-            place = self.robot.wheel_positions_m, self.robot.wheel_directions_rad
-            rho = float(np.exp(parameters[3 + i]))
-            twist = steady_twist(speeds, *place, self.loads(parameters), rho, float(parameters[2]))
-            free = steady_twist(speeds, *place, np.full(3, 1 / 3), 0.0)
-            speed = np.linalg.norm(free[:, :2], axis=1)
-            ahead = free[:, :2] / speed[:, None]
-            slip[rows] = 1.0 - (twist[:, :2] * ahead).sum(axis=1) / speed
-            side[rows] = (ahead[:, 0] * twist[:, 1] - ahead[:, 1] * twist[:, 0]) / speed
-        return slip, side
-
-    def misfit(self, cases: _Cases, group: str, parameters: Array) -> Array:
-        """Return what the law leaves (n, 2) of slip and sideways speed."""
-        slip, side = self.motion(cases, parameters, group)
-        return np.column_stack([slip - cases.slip, side - cases.side])
-
-    def fit(self, cases: _Cases, clusters: Array | None = None) -> Fit:
-        return identify(partial(self.misfit, cases, ""), self.parameters, clusters)
-
-    def other_load(
-        self, cases: _Cases, best: Array
-    ) -> tuple[str, tuple[float, ...], tuple[float, float]] | None:
-        """Return the surface that explains runs best, the load that does so on it, and what is left."""
-        if len(cases.slip) < MIN_RUNS:
-            return None
-        before = {name: _rms(self.misfit(cases, name, best)) for name in self.surfaces}
-        surface = min(before, key=before.__getitem__)
-        found = identify(
-            lambda loads: self.misfit(cases, surface, np.concatenate([loads, best[2:]])),
-            self.parameters[:2],
-            starts=[best[:2]],
-        )
-        return surface, tuple(self.loads(found.value).tolist()), (before[surface], _rms(found.residual))
-
-
-def _cases(runs: Sequence[MeasuredSlip], groups: Sequence[str]) -> _Cases:
-    speeds, slips, sides, names = [], [], [], []
-    for run, group in zip(runs, groups, strict=True):
-        rows = run.steady & np.isfinite(run.body_slip)
-        if rows.any():
-            speeds.append(np.median(run.wheel_speed_mps[rows], axis=0))
-            slips.append(float(np.median(run.body_slip[rows])))
-            sides.append(float(np.median(run.body_side[rows])))
-            names.append(group)
-    return _Cases(np.array(speeds).reshape(len(names), -1), np.array(slips), np.array(sides), np.array(names))
 
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
+
+
+def surface_of_windows(slip: MeasuredSlip, found: RollerFindings, robot: Robot) -> list[str]:
+    """Return the surface whose rollers explain each window of a run best; empty where it is not steady."""
+    named, rows = [""] * len(slip.steady), slip.known[np.isfinite(slip.body_side[slip.known])]
+    seen = np.column_stack([slip.body_slip[rows], slip.body_side[rows]])
+    loads, off = np.array(found.load_ratio), []
+    for ratio in found.roller_ratio.values():
+        motion = law_motion(robot, slip.wheel_speed_mps[rows], loads, max(ratio, 1e-6), found.scale_error)
+        off.append(np.hypot(*(motion - seen).T))
+    for row, best in zip(rows.tolist(), np.argmin(off, axis=0).tolist(), strict=True):
+        named[row] = list(found.roller_ratio)[best]
+    return named
 
 
 MIN_CORRELATION = 0.8
@@ -284,8 +248,7 @@ def distance_bound(
     if len(turns) < 3:
         return None
     rolled, seen = np.array(turns).T
-    spread = float(np.sqrt((rolled @ rolled) * (seen @ seen)))
-    correlation = float(rolled @ seen) / spread if spread > 0.0 else 0.0
+    correlation = float(agreement(rolled[:, None], seen[:, None])[0][0])
     if correlation < MIN_CORRELATION:
         return None
     rows = bootstrap_rows(len(turns), N_DISTANCE_DRAWS, rng)
@@ -306,43 +269,6 @@ def rollers_of(found: Measured, robot: Robot) -> RollerFindings:
     return roller_findings([found.slips[i] for i in known], groups, robot, surfaces)
 
 
-def named_surfaces(found: Measured, robot: Robot, rollers: RollerFindings) -> tuple[NamedSurface, ...]:
-    """Return which surface rollers name in the windows of each group, runs without a label by session."""
-    windows: dict[str, Counter[str]] = {}
-    right: dict[str, list[bool]] = {}
-    for run, slip in zip(found.runs, found.slips, strict=True):
-        names = [name for name in surface_of_windows(slip, rollers, robot) if name]
-        if not names:
-            continue
-        group = run.session or single_terrain(run)
-        windows.setdefault(group, Counter()).update(names)
-        if single_terrain(run) in rollers.roller_ratio:
-            right.setdefault(group, []).append(Counter(names).most_common(1)[0][0] == single_terrain(run))
-    rows = []
-    for group, counts in sorted(windows.items()):
-        judged = right.get(group)
-        n_right = sum(judged) if judged else None
-        n_runs = (
-            len(judged)
-            if judged
-            else sum((run.session or single_terrain(run)) == group for run in found.runs)
-        )
-        rows.append(NamedSurface(group, n_runs, n_right, dict(sorted(counts.items()))))
-    return tuple(rows)
-
-
-def distances_of(found: Measured, robot: Robot, seed: int) -> dict[str, DistanceBound]:
-    """Return the distance of the wheels by each surface on which the robot's turns follow them."""
-    omni, bounds = as_drive(OmniRobot, robot, NO_ROLLERS), {}
-    alone = [pair for pair in zip(found.runs, found.slips, strict=True) if not pair[0].session]
-    for name in sorted({single_terrain(run) for run, _ in alone} - {""}):
-        slips = [slip for run, slip in alone if single_terrain(run) == name]
-        bound = distance_bound(slips, omni, np.random.default_rng(seed))
-        if bound is not None:
-            bounds[name] = bound
-    return bounds
-
-
 class NamedSurface(NamedTuple):
     """Which surface the rollers of an omni robot say that runs of a group were on."""
 
@@ -358,3 +284,39 @@ class NamedSurface(NamedTuple):
             return f"{self.n_right} of {self.n_runs} runs are named by their slip"
         counts = ", ".join(f"{name} {n}" for name, n in sorted(self.windows.items(), key=lambda x: -x[1]))
         return f"windows of {self.n_runs} runs look like {counts}"
+
+
+def named_surfaces(found: Measured, robot: Robot, rollers: RollerFindings) -> tuple[NamedSurface, ...]:
+    """Return which surface rollers name in the windows of each group, runs without a label by session."""
+    windows: dict[str, Counter[str]] = {}
+    runs: Counter[str] = Counter()
+    right: dict[str, list[bool]] = {}
+    for run, slip in zip(found.runs, found.slips, strict=True):
+        label, names = single_terrain(run), Counter(surface_of_windows(slip, rollers, robot))
+        group = run.session or label
+        runs[group] += 1
+        del names[""]
+        if names:
+            windows.setdefault(group, Counter()).update(names)
+            if label in rollers.roller_ratio:
+                right.setdefault(group, []).append(names.most_common(1)[0][0] == label)
+    return tuple(
+        NamedSurface(
+            group,
+            len(right[group]) if group in right else runs[group],
+            sum(right[group]) if group in right else None,
+            dict(sorted(counts.items())),
+        )
+        for group, counts in sorted(windows.items())
+    )
+
+
+def distances_of(found: Measured, robot: Robot, seed: int) -> dict[str, DistanceBound]:
+    """Return the distance of the wheels by each surface on which the robot's turns follow them."""
+    omni, bounds = as_drive(OmniRobot, robot, NO_ROLLERS), {}
+    for name, own in found.by_terrain().items():
+        slips = [slip for run, slip in zip(own.runs, own.slips, strict=True) if not run.session]
+        bound = distance_bound(slips, omni, np.random.default_rng(seed))
+        if name and bound is not None:
+            bounds[name] = bound
+    return bounds

@@ -30,7 +30,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,7 +42,7 @@ from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.errors import DataError
 from terrain.identify import Fit, Parameter, folds, identify
 from terrain.logs.testbed import STREAM
-from terrain.records import Array, RunLog, read_only
+from terrain.records import Array, RunLog
 from terrain.terramechanics.inflow_wheel import FORCE, NAMES, bulldozing_ratio, wheel_forces
 from terrain.terramechanics.soil import Soil, load_soil
 from terrain.terramechanics.traction import ground_record, wheel_ground
@@ -74,8 +75,7 @@ WHEELS: dict[str, Wheel] = {
 MIN_SETTINGS = 20  #: Settings of slip and angle below which a law with twenty parameters is not fitted
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Trials:
+class Trials(NamedTuple):
     """Trials of one wheel, each array (n,)."""
 
     #: wheel_radps, travel_mps, slip_angle_rad: measured motion; the commanded angle, which the wheel keeps
@@ -92,16 +92,14 @@ class Trials:
     angle_setting: Array
     n_trials: Array  #: number of trials behind an entry
 
-    def __post_init__(self) -> None:
-        for each in fields(self):
-            object.__setattr__(self, each.name, read_only(getattr(self, each.name)))
-
-    def __len__(self) -> int:
+    @property
+    def n(self) -> int:
+        """Number of entries."""
         return int(self.load_n.size)
 
     def chosen(self, rows: Array) -> Trials:
         """Return the trials of a mask or of row numbers (m,)."""
-        return Trials(*(getattr(self, each.name)[rows] for each in fields(self)))
+        return Trials._make(column[rows] for column in self)
 
 
 def trials_of(runs: Sequence[RunLog], wheel: Wheel) -> Trials:
@@ -146,10 +144,8 @@ def setting_means(trials: Trials) -> Trials:
         raise DataError(
             f"trials have {len(counts)} settings of slip and angle, a fit needs {MIN_SETTINGS} or more"
         )
-    means = {
-        each.name: np.bincount(index.ravel(), getattr(trials, each.name)) / counts for each in fields(trials)
-    }
-    return replace(Trials(**means), n_trials=counts)
+    means = Trials._make(np.bincount(index.ravel(), column) / counts for column in trials)
+    return means._replace(n_trials=counts.astype(float))
 
 
 MIN_ANGLE_DEG, MAX_SLIP = 89.0, -0.99
@@ -185,10 +181,10 @@ def calibration_rows(trials: Trials) -> Array:
 def side_coupling(trials: Trials) -> Coupling:
     """Return the coupling that the trials of a locked wheel along its axle show."""
     own = trials.chosen(calibration_rows(trials))
-    if len(own) < MIN_TRIALS:
-        return Coupling(np.nan, np.nan, len(own))
+    if own.n < MIN_TRIALS:
+        return Coupling(np.nan, np.nan, own.n)
     ratio = float((own.pull_n * own.side_n).sum() / (own.side_n**2).sum())
-    return Coupling(ratio, float(np.std(own.pull_n / own.side_n, ddof=1)), len(own))
+    return Coupling(ratio, float(np.std(own.pull_n / own.side_n, ddof=1)), own.n)
 
 
 def without_coupling(trials: Trials, coupling: Coupling) -> Trials:
@@ -198,7 +194,7 @@ def without_coupling(trials: Trials, coupling: Coupling) -> Trials:
     """
     if np.isnan(coupling.ratio):
         return trials
-    corrected = replace(trials, pull_n=trials.pull_n - coupling.ratio * trials.side_n)
+    corrected = trials._replace(pull_n=trials.pull_n - coupling.ratio * trials.side_n)
     return corrected.chosen(~calibration_rows(trials))
 
 
@@ -218,26 +214,21 @@ class Law(NamedTuple):
 
 
 _ARC = ("pressure_exponent", "peak_ratio", "peak_slip_ratio", "exit_ratio", "tan_friction", "shear_modulus_m")
-_SIDE = (
-    "exit_slip_ratio",
-    "side_inflow_ratio",
-    "side_pressure_ratio",
-    "side_friction_ratio",
-    "side_lift_ratio",
-)
-_NO_SIDE = dict.fromkeys((*_SIDE, "inflow"), 0.0)
+_SIDE = ("inflow", "pressure", "friction", "lift")
+_NO_SIDE = dict.fromkeys((*(f"side_{name}_ratio" for name in _SIDE), "exit_slip_ratio", "inflow"), 0.0)
 _BULLDOZING = _NO_SIDE | {"side_depth_exponent": 1.0, "travel_exponent": 1.0, "rotation_exponent": 0.0}
 _BEKKER = _NO_SIDE | {"peak_ratio": 0.0, "peak_slip_ratio": 0.0, "exit_ratio": 0.0}
 _BEKKER_FREE = "pressure_exponent", "tan_friction", "shear_modulus_m"
 _BEKKER_TEXT = "Bekker's pressure by depth in front of the axle, Janosi's shear, Lyasko's sinkage"
-_WONG_TEXT = "Wong and Reece's peak and exit, Lyasko's sinkage"
 ALL = tuple(name for name in NAMES if name not in ("cohesion_pa", "inflow"))
 
 LAWS: dict[str, Law] = {
     law.name: law
     for law in (
         Law("bekker", "lyasko", _BEKKER_FREE, _BEKKER, False, _BEKKER_TEXT),
-        Law("wong_reece", "lyasko", _ARC, _NO_SIDE, False, _WONG_TEXT),
+        Law(
+            "wong_reece", "lyasko", _ARC, _NO_SIDE, False, "Wong and Reece's peak and exit, Lyasko's sinkage"
+        ),
         Law("ishigami", "lyasko", _ARC, _BULLDOZING, True, "and Ishigami's bulldozing of the side face"),
         Law("ishigami_ding", "ding", _ARC, _BULLDOZING, True, "the same with Ding's sinkage"),
         Law("ishigami_travel", "travel", _ARC, _BULLDOZING, True, "the same with the sinkage by travel"),
@@ -259,7 +250,7 @@ class Prediction(NamedTuple):
 def force_vector(law: Law, values: Array) -> Array:
     """Return all parameters of the forces (17,), the free ones being ``values``."""
     named = {name: entry[0] for name, entry in FORCE.items()} | dict(law.fixed)
-    named |= dict(zip(law.free, np.asarray(values).tolist(), strict=True))
+    named.update(zip(law.free, np.asarray(values).tolist(), strict=True))
     if law.tied:
         named["side_pressure_ratio"] = bulldozing_ratio(named["tan_friction"])
     return np.array([named[name] for name in NAMES])
@@ -280,16 +271,14 @@ def sinkage_of(law: Law, values: Array, trials: Trials, wheel: Wheel) -> Array:
 
 def _motion(trials: Trials) -> Array:
     """Return motion and load (n, 4) as :func:`~terrain.terramechanics.inflow_wheel.wheel_forces` takes them."""
-    columns = (trials.wheel_radps, trials.travel_mps, trials.slip_angle_rad, trials.load_n)
-    return np.ascontiguousarray(np.column_stack(columns))
+    return np.ascontiguousarray(np.array([*trials[:3], trials.load_n]).T)
 
 
 def forces_of(law: Law, values: Array, trials: Trials, wheel: Wheel, sinkage_m: Array) -> Prediction:
     """Return the forces of each trial for a sinkage (n,) in m."""
-    depths = np.ascontiguousarray(sinkage_m)
-    vector = force_vector(law, values)
-    found = wheel_forces(vector, wheel.tip_radius_m, wheel.width_m, _motion(trials), depths)
-    return Prediction(found[:, 0], found[:, 1], depths, found[:, 2])
+    depths, vector = np.ascontiguousarray(sinkage_m), force_vector(law, values)
+    pull, side, modulus = wheel_forces(vector, wheel.tip_radius_m, wheel.width_m, _motion(trials), depths).T
+    return Prediction(pull, side, depths, modulus)
 
 
 SINKAGE_MISFIT_M = 2e-3
@@ -318,29 +307,28 @@ def fit_law(law: Law, trials: Trials, wheel: Wheel, start: LawFit | None = None)
     weight = np.sqrt(trials.n_trials / trials.n_trials.mean())
     scale = weight / (FORCE_MISFIT_RATIO * trials.load_n)
 
-    def fit(misfit: Callable[[Array], Array], parameters: list[Parameter], before: Fit | None) -> Fit:
+    def fit(misses: Callable[[Array], Array], parameters: list[Parameter], before: Fit | None) -> Fit:
         starts = [np.array([p.nominal + s * p.prior_std for p in parameters]) for s in _STARTS]
-        if before is not None:
-            starts = [before.value]
-        return identify(misfit, parameters, starts=starts, diff_step=1e-4, xtol=1e-5, ftol=1e-5, max_nfev=60)
+        starts = starts if before is None else [before.value]
+        return identify(misses, parameters, starts=starts, diff_step=1e-4, xtol=1e-5, ftol=1e-5, max_nfev=60)
 
-    def depth_misfit(values: Array) -> Array:
-        miss = sinkage_of(law, values, trials, wheel) - trials.sinkage_m
-        return np.asarray(miss * weight / SINKAGE_MISFIT_M)
+    def depth_misses(values: Array) -> Array:
+        return np.asarray(
+            (sinkage_of(law, values, trials, wheel) - trials.sinkage_m) * weight / SINKAGE_MISFIT_M
+        )
 
-    depth = [Parameter(name, mean, 0.0, prior_std=std) for name, (mean, std) in SINKAGES[law.sinkage].items()]
-    sinkage = fit(depth_misfit, depth, None if start is None else start.sinkage)
-    depths = sinkage_of(law, sinkage.value, trials, wheel)
-
-    def force_misfit(values: Array) -> Array:
+    def force_misses(values: Array) -> Array:
         found = forces_of(law, values, trials, wheel, depths)
         return np.concatenate(
             [(found.pull_n - trials.pull_n) * scale, (found.side_n - trials.side_n) * scale]
         )
 
+    depth = [Parameter(name, mean, 0.0, prior_std=std) for name, (mean, std) in SINKAGES[law.sinkage].items()]
+    sinkage = fit(depth_misses, depth, None if start is None else start.sinkage)
+    depths = sinkage_of(law, sinkage.value, trials, wheel)
     priors = ((name, *FORCE[name]) for name in law.free)
     force = [Parameter(name, mean, low, high, std) for name, mean, std, low, high in priors]
-    return LawFit(law, wheel, sinkage, fit(force_misfit, force, None if start is None else start.force))
+    return LawFit(law, wheel, sinkage, fit(force_misses, force, None if start is None else start.force))
 
 
 def predict(fit: LawFit, trials: Trials, given: str = "load") -> Prediction:
@@ -376,25 +364,25 @@ def parameters_of(
     on_draw : called after each sample
     """
     draws = []
-    for count in bootstrap_counts(len(trials), n_draws, seed):
-        rows = np.flatnonzero(count)
-        sample = trials.chosen(rows)
-        weighed = replace(sample, n_trials=sample.n_trials * count[rows])
-        again = fit_law(fit.law, weighed, fit.wheel, start=fit)
+    for count in bootstrap_counts(trials.n, n_draws, seed):
+        sample = trials.chosen(rows := np.flatnonzero(count))
+        again = fit_law(
+            fit.law, sample._replace(n_trials=sample.n_trials * count[rows]), fit.wheel, start=fit
+        )
         draws.append(np.concatenate([again.sinkage.value, again.force.value]))
         on_draw()
-    drawn = np.array(draws).T if draws else None
     found: dict[str, SoilParameter] = {}
     for own in (fit.sinkage, fit.force):
-        columns = (own.value, own.std, *own.interval, own.identified)
-        for p, value, std, low, high, identified in zip(
-            own.parameters, *(c.tolist() for c in columns), strict=True
-        ):
-            if drawn is not None:
-                least, most = percentile_interval(drawn[len(found)])
+        columns = zip(own.parameters, own.value, own.std, *own.interval, own.identified, strict=True)
+        for p, value, std, low, high, identified in columns:
+            if draws:
+                least, most = percentile_interval(np.array(draws)[:, len(found)])
                 low, high = min(low, least), max(high, most)
-            interval = max(low, p.low), min(high, p.high)
-            found[p.name] = SoilParameter(p.name, value, interval, p.prior_std, std / p.prior_std, identified)
+            interval = max(float(low), p.low), min(float(high), p.high)
+            informed = float(std) / p.prior_std
+            found[p.name] = SoilParameter(
+                p.name, float(value), interval, p.prior_std, informed, bool(identified)
+            )
     return found
 
 
@@ -458,12 +446,17 @@ class PlainFit(NamedTuple):
     intervals: dict[str, tuple[float, float]]
     n_trials: int
 
+    @property
+    def soil(self) -> Soil:
+        """The soil, what one wheel under one load says nothing of taken as none."""
+        return plain_soil(np.array(list(self.values.values())))
 
-def plain_soil(values: Array, name: str) -> Soil:
+
+def plain_soil(values: Array) -> Soil:
     """Return the soil of fitted values (4,) in the order of :data:`PARAMETERS`."""
     assumed = "rolling_resistance_ratio", "roughness_m3", "cohesion_pa", "kc_npmn1"
-    named = dict(zip(PARAMETERS, np.asarray(values).tolist(), strict=True)) | dict.fromkeys(assumed, 0.0)
-    return Soil(name, "janosi", sinkage_exponent_ratio=1.0, **named)
+    named = dict(zip(PARAMETERS, values.tolist(), strict=True)) | dict.fromkeys(assumed, 0.0)
+    return Soil("fit", "janosi", sinkage_exponent_ratio=1.0, **named)
 
 
 def plain_prediction(soil: Soil, trials: Trials, wheel: Wheel) -> Prediction:
@@ -472,13 +465,13 @@ def plain_prediction(soil: Soil, trials: Trials, wheel: Wheel) -> Prediction:
     Lateral slip is over the larger of both speeds along the wheel, as in the simulator.
     """
     ground = ground_record(soil, wheel.tip_radius_m, wheel.width_m, 0.0)[0]
-    out = np.full((len(trials), 4), np.nan)
+    out = np.full((trials.n, 4), np.nan)
     for i, (omega, travel, angle, load) in enumerate(_motion(trials)):
         speed, ahead, across = omega * wheel.radius_m, travel * math.cos(angle), travel * math.sin(angle)
         fastest = max(speed, abs(ahead), 1e-9)
         slip_x, slip_y = (speed - ahead) / fastest, across / fastest
         thrust, side, resistance, sinkage = wheel_ground(ground, load, slip_x, slip_y)
-        out[i] = thrust - resistance, side, sinkage, math.nan
+        out[i, :3] = thrust - resistance, side, sinkage
     return Prediction(*out.T)
 
 
@@ -503,71 +496,61 @@ def fit_plain_soil(
     DataError
         if there are fewer settings than parameters.
     """
-    if len(trials) < len(PARAMETERS):
-        raise DataError(f"trials have {len(trials)} settings, the simulator's law needs {len(PARAMETERS)}")
+    if trials.n < len(PARAMETERS):
+        raise DataError(f"trials have {trials.n} settings, the simulator's law needs {len(PARAMETERS)}")
     names, bounds = list(PARAMETERS), np.log(list(PARAMETERS.values()))
     held = 0 if math.isnan(friction_angle_rad) else 1
-    given = bounds[:, 0].copy()
+    logs = bounds[:, 0].copy()
     if held:
-        given[0] = math.log(friction_angle_rad)
-    parameters = [Parameter(names[i], given[i], *bounds[i, 1:]) for i in range(held, len(names))]
+        logs[0] = math.log(friction_angle_rad)
+    parameters = [Parameter(names[i], logs[i], *bounds[i, 1:]) for i in range(held, len(names))]
+
+    def misses(weight: Array, values: Array) -> Array:
+        found = plain_prediction(plain_soil(np.exp([*logs[:held], *values])), trials, wheel)
+        forces = found.pull_n - trials.pull_n, found.side_n - trials.side_n
+        scaled = [force / trials.load_n / FORCE_MISFIT_RATIO for force in forces]
+        depth = (found.sinkage_m - trials.sinkage_m) / SINKAGE_M
+        return np.concatenate([weight * miss for miss in (*scaled, depth)])
 
     def identified(weight: Array, start: Array) -> Array:
-        """Return the logarithms (4,) that fit trials with weights (n,) best."""
+        """Return the logarithms of what is not held that fit trials with weights (n,) best."""
+        return identify(partial(misses, weight), parameters, starts=[start], max_nfev=60).value
 
-        def misses(logs: Array) -> Array:
-            given[held:] = logs
-            found = plain_prediction(plain_soil(np.exp(given), "fit"), trials, wheel)
-            forces = found.pull_n - trials.pull_n, found.side_n - trials.side_n
-            scaled = [force / trials.load_n / FORCE_MISFIT_RATIO for force in forces]
-            return np.concatenate(
-                [weight * miss for miss in (*scaled, (found.sinkage_m - trials.sinkage_m) / SINKAGE_M)]
-            )
-
-        own = identify(misses, parameters, starts=[start[held:]], max_nfev=60).value
-        return np.concatenate([given[:held], own])
-
-    best = identified(np.ones(len(trials)), given.copy())
-    counts = bootstrap_counts(len(trials), n_draws, seed)
-    draws = np.exp([identified(np.sqrt(count), best) for count in counts]).reshape(-1, len(names))
+    best = identified(np.ones(trials.n), logs[held:])
+    draws = [identified(np.sqrt(count), best) for count in bootstrap_counts(trials.n, n_draws, seed)]
     intervals = dict.fromkeys(names, (math.nan, math.nan))
     if n_draws:
-        intervals |= zip(names[held:], map(percentile_interval, draws.T[held:]), strict=True)
-    return PlainFit(
-        dict(zip(names, np.exp(best).tolist(), strict=True)), intervals, int(trials.n_trials.sum())
-    )
+        intervals |= zip(names[held:], map(percentile_interval, np.exp(draws).T), strict=True)
+    values = dict(zip(names, np.exp([*logs[:held], *best]).tolist(), strict=True))
+    return PlainFit(values, intervals, int(trials.n_trials.sum()))
 
 
 def soil_yaml(name: str, wheel: str, dataset: str, fit: PlainFit, friction: SoilParameter, law: str) -> str:
     """Return the text of a soil file, as ``data/soils`` describes soils."""
-
-    def entry(key: str, value: float, source: str) -> None:
+    trials, by = f"{fit.n_trials} trials of the {wheel} wheel", f"terrain calibrate on {dataset}"
+    low, high = (math.atan(bound) for bound in friction.interval)
+    interval = f"95 % over settings of slip and angle: {low:.3f} to {high:.3f} rad"
+    rough = load_soil("dry_sand").roughness_m3
+    rows = [
+        ("rolling_resistance_ratio", 0.0, "assumed: a rigid wheel has no loss of its own"),
+        ("slip_sinkage_ratio", None, ""),
+        ("roughness_m3", rough, "assumed: that of dry_sand; a testbed has none"),
+        ("cohesion_pa", 0.0, "assumed: under one load cohesion cannot be separated from friction"),
+        ("friction_angle_rad", math.atan(friction.value), f"{by}, {wheel} wheel, law {law}; {interval}"),
+        ("shear_modulus_m", None, ""),
+        ("kc_npmn1", 0.0, "assumed: one width of wheel says nothing of it"),
+        ("kphi_npmn2", None, ""),
+        ("sinkage_exponent_ratio", 1.0, "assumed: one load says nothing of it"),
+    ]
+    described: dict[str, Any] = {"name": name, "law": "janosi"}
+    for key, value, source in rows:
+        if value is None:
+            value, (low, high) = fit.values[key], fit.intervals[key]
+            of = f"{trials}, nearly straight, law of the simulator; 95 % over settings"
+            source = f"{by}, {of}: {low:.4g} to {high:.4g}"
         unit = key.rpartition("_")[2]
         described[key] = {"value": float(f"{value:.4g}"), "unit": unit, "source": source}
-
-    def measured(key: str) -> None:
-        low, high = fit.intervals[key]
-        trials = f"{fit.n_trials} trials of the {wheel} wheel, nearly straight, law of the simulator"
-        source = f"terrain calibrate on {dataset}, {trials}; 95 % over settings: {low:.4g} to {high:.4g}"
-        entry(key, fit.values[key], source)
-
-    described: dict[str, Any] = {"name": name, "law": "janosi"}
-    entry("rolling_resistance_ratio", 0.0, "assumed: a rigid wheel has no loss of its own")
-    measured("slip_sinkage_ratio")
-    rough = load_soil("dry_sand").roughness_m3
-    entry("roughness_m3", rough, "assumed: that of dry_sand; a testbed has none")
-    entry("cohesion_pa", 0.0, "assumed: under one load cohesion cannot be separated from friction")
-    low, high = (math.atan(bound) for bound in friction.interval)
-    source = (
-        f"terrain calibrate on {dataset}, {wheel} wheel, law {law}; 95 % over settings of slip and angle: "
-        f"{low:.3f} to {high:.3f} rad"
-    )
-    entry("friction_angle_rad", math.atan(friction.value), source)
-    measured("shear_modulus_m")
-    entry("kc_npmn1", 0.0, "assumed: one width of wheel says nothing of it")
-    measured("kphi_npmn2")
-    entry("sinkage_exponent_ratio", 1.0, "assumed: one load says nothing of it")
-    head = f"# Dry sand of a wheel testbed, identified from {fit.n_trials} trials of the {wheel} wheel.\n"
+    head = f"# Dry sand of a wheel testbed, identified from {trials}.\n"
     return head + yaml.safe_dump(described, sort_keys=False, width=1000, allow_unicode=True)
 
 
@@ -606,7 +589,7 @@ class Misfit(NamedTuple):
 
 def misfit(trials: Trials, prediction: Prediction, rows: Array | None = None) -> Misfit:
     """Return the errors of a prediction of trials, or of those of a mask (n,)."""
-    rows = np.ones(len(trials), dtype=bool) if rows is None else rows
+    rows = np.ones(trials.n, dtype=bool) if rows is None else rows
     if not rows.any():
         return Misfit(0, np.nan, np.nan, np.nan)
     errors = (
@@ -627,12 +610,6 @@ def regime_misfits(trials: Trials, prediction: Prediction) -> dict[str, Misfit]:
     return found
 
 
-def setting_misfits(trials: Trials, prediction: Prediction, held_out: str) -> dict[float, Misfit]:
-    """Return the errors by the setting that was held out."""
-    setting = getattr(trials, HELD_OUT[held_out])
-    return {value: misfit(trials, prediction, setting == value) for value in np.unique(setting).tolist()}
-
-
 Predictor = Callable[[Trials, Trials], dict[str, Prediction]]
 """From training trials (means of settings) and tested trials to predictions by what is given."""
 
@@ -643,17 +620,6 @@ def law_predictor(law: Law, wheel: Wheel) -> Predictor:
     def predictions(training: Trials, tested: Trials) -> dict[str, Prediction]:
         fit = fit_law(law, training, wheel)
         return {given: predict(fit, tested, given) for given in GIVEN}
-
-    return predictions
-
-
-def simulator_predictor(wheel: Wheel) -> Predictor:
-    """Return what fits the simulator's law to all training trials; it takes no sinkage."""
-
-    def predictions(training: Trials, tested: Trials) -> dict[str, Prediction]:
-        values = np.array(list(fit_plain_soil(training, wheel).values.values()))
-        found = plain_prediction(plain_soil(values, "fit"), tested, wheel)
-        return {"load": found, "sinkage": Prediction(*(np.full(len(tested), np.nan) for _ in found))}
 
     return predictions
 
@@ -675,7 +641,7 @@ def polynomial_predictions(training: Trials, tested: Trials) -> dict[str, Predic
         np.column_stack([own.slip_ratio, own.slip_angle_rad]) for own in (training, tested)
     )
     pull, side, depth = model.fit(slips, targets).predict(tested_slips).T
-    unknown = np.full(len(tested), np.nan)
+    unknown = np.full(tested.n, np.nan)
     return {"load": Prediction(pull * tested.load_n, side * tested.load_n, depth / 10.0, unknown)}
 
 
@@ -699,7 +665,7 @@ def held_out_predictions(
     found: dict[str, list[Array]] = {}
     for training, tested in folds(getattr(trials, HELD_OUT[held_out])):
         for given, part in predictor(setting_means(trials.chosen(training)), trials.chosen(tested)).items():
-            whole = found.setdefault(given, [np.full(len(trials), np.nan) for _ in part])
+            whole = found.setdefault(given, [np.full(trials.n, np.nan) for _ in part])
             for all_trials, these in zip(whole, part, strict=True):
                 all_trials[tested] = these
         on_fold()
@@ -818,6 +784,7 @@ def compare_laws(
     """
     raw, coupling = trials, side_coupling(trials)
     trials = without_coupling(trials, coupling)
+    straight = np.abs(trials.angle_setting) < AXLE_ANGLE_DEG
     n_folds = sum(len(np.unique(getattr(trials, name))) for name in HELD_OUT.values())
     fits, total = itertools.count(1), n_folds * (len(laws) + 1) + draws
 
@@ -827,21 +794,29 @@ def compare_laws(
     def held_out(predictor: Predictor) -> dict[str, dict[str, Prediction]]:
         return {held: held_out_predictions(trials, predictor, held, count) for held in HELD_OUT}
 
+    predictor: Predictor
+
+    def by_simulator(training: Trials, tested: Trials) -> dict[str, Prediction]:
+        found = plain_prediction(fit_plain_soil(training, wheel).soil, tested, wheel)
+        return {
+            "load": found,
+            "sinkage": Prediction._make(np.full((4, tested.n), np.nan)),
+        }  # it takes no sinkage
+
     def compared(name: str) -> Law:
         """Return a law, without the coupling among its parameters where the testbed's is known."""
         if math.isnan(coupling.ratio):
             return LAWS[name]
         return LAWS[name]._replace(free=tuple(each for each in LAWS[name].free if each != "coupling_ratio"))
 
-    straight, rows, predictions = np.abs(trials.angle_setting) < AXLE_ANGLE_DEG, [], {}
+    rows, predictions = [], {}
     for name in laws:
-        text, n_parameters, predictor = SIMULATOR_TEXT, len(PARAMETERS), simulator_predictor(wheel)
+        text, n_parameters, predictor = SIMULATOR_TEXT, len(PARAMETERS), by_simulator
         if name != "simulator":
             law = compared(name)
             text, n_parameters = law.text, len(law.free) + len(SINKAGES[law.sinkage])
             predictor = law_predictor(law, wheel)
-        predictions = held_out(predictor)
-        errors = []
+        predictions, errors = held_out(predictor), []
         for given in predictions.values():
             load = misfit(trials, given["load"])
             reached = max(load.pull_ratio, load.side_ratio) <= BAR_RATIO
@@ -849,24 +824,26 @@ def compare_laws(
             errors.append(HeldOut(load, misfit(trials, given["sinkage"]), below, reached))
         rows.append(LawRow(name, text, n_parameters, *errors))
     law, means = compared(laws[-1]), setting_means(trials)
-    reference = held_out(polynomial_predictions)
+    reference, checked = held_out(polynomial_predictions), None
     fit = fit_law(law, means, wheel)
-    checked = None
     if further is not None:
         further = without_coupling(further, coupling)
         checked = Checked(*(misfit(further, predict(fit, further, given)) for given in GIVEN))
     parameters = parameters_of(fit, means, draws, seed, count)
     cohesion = tuple(cohesion_profile(law, means, wheel, COHESIONS_PA))
-    modulus = modulus_spread(fit, trials)
-    angle_rad = math.atan(parameters["tan_friction"].value)
+    modulus, angle_rad = modulus_spread(fit, trials), math.atan(parameters["tan_friction"].value)
     plain = fit_plain_soil(nearly_straight(means), wheel, angle_rad, draws, seed)
-    own = nearly_straight(trials)
-    found = plain_prediction(plain_soil(np.array(list(plain.values.values())), "fit"), own, wheel)
+    rolling = nearly_straight(trials)
     slip, angle = (predictions[held]["load"] for held in HELD_OUT)
+    by_setting = {
+        held: {each: misfit(trials, last, own == each) for each in np.unique(own).tolist()}
+        for (held, name), last in zip(HELD_OUT.items(), (slip, angle), strict=True)
+        for own in [getattr(trials, name)]
+    }
     result = WheelResult(
         wheel=wheel.name,
-        n_trials=len(raw),
-        n_settings=len(setting_means(raw)),
+        n_trials=raw.n,
+        n_settings=setting_means(raw).n,
         load_range_n=(float(raw.load_n.min()), float(raw.load_n.max())),
         sinkage_range_m=(float(raw.sinkage_m.min()), float(raw.sinkage_m.max())),
         coupling=coupling,
@@ -874,8 +851,8 @@ def compare_laws(
         laws=tuple(rows),
         law=law.name,
         parameters=parameters,
-        by_slip=setting_misfits(trials, slip, "slip"),
-        by_angle=setting_misfits(trials, angle, "angle"),
+        by_slip=by_setting["slip"],
+        by_angle=by_setting["angle"],
         regimes=regime_misfits(trials, slip),
         cohesion=cohesion,
         modulus=modulus,
@@ -883,7 +860,7 @@ def compare_laws(
         surrogate_angle=misfit(trials, reference["angle"]["load"]),
         checked=checked,
         not_identified=tuple(_not_identified(parameters, cohesion, modulus, coupling)),
-        soil=SoilFile(None, plain, misfit(own, found)),
+        soil=SoilFile(None, plain, misfit(rolling, plain_prediction(plain.soil, rolling, wheel))),
     )
     return result, trials, {"slip": slip, "angle": angle}
 

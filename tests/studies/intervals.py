@@ -18,10 +18,13 @@ from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
 from pipelines.report.tree import Column, Report, Table
-from terrain.calibration.description import find
+from terrain.calibration.description import findings_of
 from terrain.calibration.odometry import SLIP, fit_odometry, legs_of_poses, level
 from terrain.calibration.sensors import fit_gravity
+from terrain.calibration.skid_steer import DELAY_RESOLUTION_S
+from terrain.calibration.skid_steer import SLIP_RATIO as RADIUS_SLIP_RATIO
 from terrain.calibration.skid_steer import identify as identify_skid
+from terrain.calibration.wheels import SLIP_RATIO
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.files.documents import read_yaml
@@ -36,7 +39,6 @@ from terrain.simulation.scenario import make_scenario
 from terrain.slip_learning.curve import (
     SHAPE_STD_RATIO,
     SYSTEMATIC_SLIP_STD,
-    Resistances,
     learn_curve,
     net_peak,
     traction_ratio,
@@ -185,8 +187,7 @@ def wheel_trials(law: Law, depth: Array, hidden: Mapping[str, float], seed: int,
     force = np.array([hidden.get(name, FORCE[name][0]) for name in law.free])
     found = forces_of(law, force, trials, WHEEL, sinkage_of(law, depth, trials, WHEEL))
     spread = noise_ratio * trials.load_n
-    return replace(
-        trials,
+    return trials._replace(
         pull_n=found.pull_n + spread * rng.standard_normal(n),
         side_n=found.side_n + spread * rng.standard_normal(n),
         sinkage_m=found.sinkage_m + 5e-4 * rng.standard_normal(n),
@@ -229,25 +230,46 @@ def _six_positions(seed: int) -> Iterator[Interval]:
 
 
 def _swerve(seed: int) -> Iterator[Interval]:
-    runs = [drive_hidden("stand", 10 * seed + k, duration_s=8.0) for k in range(3)]
-    runs += [drive_hidden(name, seed) for name in ("complex", "starts")]
-    runs += [six_positions_log(HIDDEN, 10 * seed + k, hold_s=3.0, run_id=f"bench_{k}") for k in range(3)]
+    """A robot whose zeros are off by up to half a step of their encoders, and whose wheels slip as is assumed."""
+    rng, soil, step_rad = (
+        np.random.default_rng(seed),
+        SOILS["tiles"],
+        2 * np.pi / HIDDEN.sensors.steering_steps_ratio,
+    )
+    zeros = {
+        f"zero_{i}_rad": zero + step_rad * rng.uniform(-0.5, 0.5)
+        for i, zero in enumerate(HIDDEN.steering_zeros_rad, 1)
+    }
+    own_slip = soil.rolling_resistance_ratio / (
+        soil.stiffness_ratio * soil.shape_ratio * soil.peak_friction_ratio
+    )
+    ratio = HIDDEN.motors.reduction_ratio * (1 - own_slip) / (1 - rng.uniform(*SLIP_RATIO))
+    robot = HIDDEN.with_parts(
+        steering=replace(HIDDEN.steering, **zeros), motors=replace(HIDDEN.motors, reduction_ratio=ratio)
+    )
+    runs = [drive_hidden("stand", 10 * seed + k, duration_s=8.0, robot=robot) for k in range(3)]
+    runs += [drive_hidden(name, seed, robot=robot) for name in ("complex", "starts")]
+    runs += [six_positions_log(robot, 10 * seed + k, hold_s=3.0, run_id=f"bench_{k}") for k in range(3)]
     description = read_yaml(description_file("agrimaro"))
-    for finding in find(runs, description, NOMINAL, ("tiles",)):
+    for finding in findings_of(runs, description, NOMINAL, ("tiles",)):
         section, _, name = finding.parameter.partition(".")
         if finding.determined and name:
             yield Interval(name, finding.low, finding.high, getattr(getattr(HIDDEN, section), name))
 
 
 def _skid_steer(seed: int) -> Iterator[Interval]:
+    """A robot whose wheels slip as is assumed, and whose delays are off by up to their resolution."""
+    rng, radius_m, track_m = np.random.default_rng(seed), 0.29, 1.8
     hidden = {
-        "rolling_radius_m": 0.29,
-        "effective_track_m": 1.8,
+        "rolling_radius_m": radius_m,
+        "effective_track_m": track_m,
         "lidar_delay_s": 0.3,
         "wheels_delay_s": 0.05,
     }
-    runs = [skid_run(*hidden.values(), 1000 * seed + k, n_steps=4) for k in range(8)]
-    for finding in identify_skid(runs, NOMINAL_M, ("asphalt",))[1:]:  # the radius' holds all of an assumption
+    late = np.array([0.3, 0.05]) + rng.uniform(-DELAY_RESOLUTION_S, DELAY_RESOLUTION_S, 2)
+    slip = rng.uniform(*RADIUS_SLIP_RATIO)
+    runs = [skid_run(radius_m, track_m, *late, 1000 * seed + k, slip=slip, n_steps=4) for k in range(8)]
+    for finding in identify_skid(runs, NOMINAL_M, ("asphalt",)):
         name = finding.parameter.partition(".")[2]
         yield Interval(name, finding.low, finding.high, hidden[name])
 
@@ -316,7 +338,7 @@ def _slip_curve(seed: int) -> Iterator[Interval]:
         whole = net_peak(lambda s: traction_ratio(law, theta, s) - rho, 0.0, 0.6).slip_ratio  # noqa: B023
         offset, tilt = rng.standard_normal(2) * (SYSTEMATIC_SLIP_STD, SHAPE_STD_RATIO / whole)
         runs = drawn_runs(law, theta, rng, offset=offset, tilt=tilt)
-        curve = learn_curve(runs, Resistances(np.full(len(runs), rho), np.full(len(runs), 0.01)), rng, 60)
+        curve = learn_curve(runs, np.full(len(runs), rho), np.full(len(runs), 0.01), rng, 60)
         true = net_peak(lambda s: traction_ratio(law, theta, s) - rho, *curve.slip_range)  # noqa: B023
         yield Interval(f"peak_{name}", *curve.peak_interval, true.slip_ratio)
 

@@ -24,20 +24,6 @@ from terrain.slip_learning.measured import (
 HUSKY = load_robot("husky")
 
 
-def test_the_std_of_a_rate_is_its_scatter():
-    rng = np.random.default_rng(0)
-    time_s = np.sort(rng.uniform(0.0, 2.0, 60))
-    part, start, end = np.zeros(60, np.int64), np.zeros(1), np.full(1, 2.0)
-    found = [
-        window_rates(time_s, (0.3 * time_s + rng.normal(0, 0.01, 60))[:, None], part, start, end, 3, 0.5)
-        for _ in range(400)
-    ]
-    rates, std = (np.array([each[i][0, 0] for each in found]) for i in (0, 1))
-    assert rates.mean() == pytest.approx(0.3, abs=4 * rates.std() / 20)
-    assert np.mean(np.abs(rates - 0.3) < 1.96 * std) > 0.9
-    assert np.median(std) == pytest.approx(rates.std(), rel=0.35)  # at most wider, for what is correlated
-
-
 def test_a_window_across_two_parts_or_with_few_samples_has_no_rate():
     time_s = np.linspace(0.0, 4.0, 41)
     part = (time_s > 2.0).astype(np.int64)
@@ -63,7 +49,7 @@ def test_a_jump_and_a_gap_begin_new_parts_and_add_nothing(make_omni_run, robotin
     assert length_m < 0.1 * 10.0  # what was driven in the gap is not made up
 
 
-@pytest.mark.parametrize("slip", [0.0, 0.1, 0.5, -0.2])
+@pytest.mark.parametrize("slip", [0.0, 0.5, -0.2])
 @pytest.mark.parametrize("twist", [(0.1, 0.0, 0.0), (-0.05, 0.0866, 0.0), (0.2, 0.1, 0.4), (0.0, -0.3, -0.8)])
 def test_a_hidden_slip_of_an_omni_robot_comes_back(make_omni_run, robotino, slip, twist):
     found = measured_slip(make_omni_run(twist=twist, slip=slip, noise_m=0.0, start_s=-1.0), robotino)

@@ -1,4 +1,4 @@
-"""Stresses of a wheel at a slip angle: symmetry, limits, and the kernel against plain quadrature."""
+"""A wheel at a slip angle, its stresses and its sinkage: symmetry, limits, and the kernel against plain quadrature."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from terrain.terramechanics.inflow_wheel import (
     bulldozing_ratio,
     wheel_forces,
 )
+from terrain.terramechanics.travel_sinkage import TRAVEL, travel_sinkage
 
 R, B, V, LOAD = 0.058, 0.05, 0.01, 22.0
 
@@ -130,3 +131,17 @@ def test_bulldozing_is_that_of_hegedus_and_grows_with_friction():
     d2 = 1 / math.tan(broken) + 1 / math.tan(broken) ** 2 * math.tan(phi)
     assert bulldozing_ratio(math.tan(phi)) == pytest.approx(d1 * d2)
     assert bulldozing_ratio(0.7) > bulldozing_ratio(0.6)
+
+
+def depth(wheel_mps, angle_rad):
+    start, motion = np.array([value for value, _ in TRAVEL.values()]), ([wheel_mps], [V], [angle_rad])
+    return float(travel_sinkage(start, *map(np.array, motion), R)[0])
+
+
+def test_a_wheel_sinks_deeper_by_slip_skid_and_angle_down_to_its_axle():
+    assert depth(0.01, 0.0) == pytest.approx(TRAVEL["rolling_m"][0])
+    assert depth(0.0, np.pi / 2) == pytest.approx(R)
+    assert depth(0.0, 0.0) > depth(0.005, 0.0) > depth(0.01, 0.0) < depth(0.02, 0.0) < depth(0.1, 0.0)
+    for wheel_mps in (0.0, 0.01, 0.05):
+        assert depth(wheel_mps, 0.6) == depth(wheel_mps, -0.6)
+        assert (np.diff([depth(wheel_mps, angle) for angle in np.linspace(0.2, 1.5, 9)]) > 0.0).all()

@@ -11,32 +11,17 @@ from terrain.terramechanics.soil import LAWS, RANGES, SINKAGE, Soil, load_soil, 
 
 
 def test_the_eight_classes_are_there_and_have_the_numbers_of_their_law():
-    assert set(soil_names()) == {
-        "tiles",
-        "asphalt",
-        "firm_soil_gravel",
-        "grass",
-        "tilled_loam",
-        "clay",
-        "snow",
-        "dry_sand",
-    }
+    names = "tiles asphalt firm_soil_gravel grass tilled_loam clay snow dry_sand"
+    assert set(soil_names()) == set(names.split())
     for name in soil_names():
         soil = load_soil(name)
         assert soil.name == name
         has = {key for key in RANGES if math.isfinite(getattr(soil, key))}
-        assert has - set(SINKAGE) == {
-            "rolling_resistance_ratio",
-            "slip_sinkage_ratio",
-            "roughness_m3",
-            *LAWS[soil.law],
-        }
+        common = {"rolling_resistance_ratio", "slip_sinkage_ratio", "roughness_m3"}
+        assert has - set(SINKAGE) == common | set(LAWS[soil.law])
         assert has & set(SINKAGE) in (set(), set(SINKAGE))
         assert soil.thrust_field_ratio > 0
         assert soil.resistance_field_ratio > 0
-
-
-def test_every_number_of_a_soil_has_a_range():
     assert set(RANGES) == {item.name for item in fields(Soil) if item.type == "float"}
 
 
@@ -49,24 +34,16 @@ def scatter_of(entry):
     [
         (lambda d: d.pop("law"), "key 'law' is missing"),
         (lambda d: d.update(law="pacejka"), "law 'pacejka' is unknown: use one of janosi, magic"),
-        (lambda d: d.update(law=["janosi"]), "law ['janosi'] is unknown"),
         (lambda d: d.update(law="magic"), "key 'cohesion_pa' is unknown (accepted: name, law,"),
         (lambda d: d.pop("shear_modulus_m"), "key 'shear_modulus_m' is missing"),
-        (lambda d: d.pop("kc_npmn1"), "key 'kc_npmn1' is missing"),
         (lambda d: d["friction_angle_rad"].update(value=28.0), "friction_angle_rad is 28, at most 1.2"),
         (lambda d: d["shear_modulus_m"].update(value=0.0), "shear_modulus_m is 0.0, a number above zero"),
         (lambda d: d["cohesion_pa"].update(value=-1.0), "cohesion_pa is -1.0, a number from zero up"),
-        (lambda d: d["sinkage_exponent_ratio"].update(value=3.0), "sinkage_exponent_ratio is 3, at most 2"),
         (lambda d: d["cohesion_pa"].update(interval=[1, 2]), "key 'interval' is unknown"),
         (lambda d: d["cohesion_pa"].update(scatter=0.2), "cohesion_pa: scatter is 0.2, a mapping with run"),
         (lambda d: scatter_of(d).pop("source"), "friction_angle_rad: scatter: key 'source' is missing"),
         (lambda d: scatter_of(d).update(source=" "), "friction_angle_rad: scatter: run has no source"),
-        (lambda d: scatter_of(d).update(run=-0.1), "scatter: run is -0.1, a number from zero up"),
         (lambda d: scatter_of(d).update(field=8.0), "scatter: field is 8, at most 1"),
-        (
-            lambda d: d["cohesion_pa"]["scatter"].update(field=0.1),
-            "cohesion_pa: scatter: key 'field' is unknown",
-        ),
     ],
 )
 def test_an_impossible_soil_is_refused_in_one_sentence(tmp_path, change, message):
@@ -80,13 +57,10 @@ def test_an_impossible_soil_is_refused_in_one_sentence(tmp_path, change, message
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["mud", "../soils/clay", "none.yaml"])
-def test_an_unknown_soil_is_named(name):
-    with pytest.raises(ConfigError, match=name.replace(".", r"\.")):
-        load_soil(name)
-
-
-def test_a_file_that_is_no_mapping_is_refused(tmp_path):
+def test_an_unknown_soil_is_named_and_a_file_that_is_no_mapping_refused(tmp_path):
+    for name in ("mud", "../soils/clay", "none.yaml"):
+        with pytest.raises(ConfigError, match=name.replace(".", r"\.")):
+            load_soil(name)
     path = tmp_path / "list.yaml"
     path.write_text("- clay\n")
     with pytest.raises(ConfigError, match=r"list\.yaml is \['clay'\], a mapping with name, law is required"):
@@ -115,10 +89,5 @@ def test_scatter_has_the_spread_and_the_bounds_that_the_description_states(name)
         # A normal cut at two sigma (with its tails left on the cut) keeps 0.96 of its standard deviation.
         assert abs(log.mean()) < 4 * sigma / math.sqrt(2000)
         assert log.std() == pytest.approx(0.96 * sigma, rel=0.06)
-
-
-def test_scatter_is_seeded_and_leaves_the_description_alone():
-    sand = load_soil("dry_sand")
-    assert scattered(sand, np.random.default_rng(3)) == scattered(sand, np.random.default_rng(3))
-    assert scattered(sand, np.random.default_rng(3)) != scattered(sand, np.random.default_rng(4))
-    assert sand == load_soil("dry_sand")
+    assert scattered(soil, np.random.default_rng(3)) == scattered(soil, np.random.default_rng(3))
+    assert soil == load_soil(name)

@@ -14,7 +14,6 @@ from terrain.terramechanics.traction import (
     friction_limit,
     ground_record,
     janosi_force,
-    magic_force,
     mobilised_ratio,
     net_pull,
     wheel_ground,
@@ -85,23 +84,6 @@ def test_laws_of_ground_that_shears(slip, more, limit_n, length_m, k_m):
     assert janosi_force(0.0, limit_n, length_m, k_m) == 0
 
 
-@given(
-    slip=slips,
-    normal_n=st.floats(0.0, 1e4),
-    b=st.floats(0.1, 30.0),
-    c=st.floats(0.5, 3.0),
-    d=st.floats(0.05, 1.5),
-    e=st.floats(-5.0, 1.0),
-)
-def test_laws_of_hard_ground(slip, normal_n, b, c, d, e):
-    force_n = magic_force(slip, normal_n, b, c, d, e)
-    assert magic_force(-slip, normal_n, b, c, d, e) == -force_n
-    assert abs(force_n) <= normal_n * d
-    assert force_n * slip >= 0
-    tiny = 1e-7
-    assert magic_force(tiny, normal_n, b, c, d, e) == pytest.approx(normal_n * b * c * d * tiny, rel=1e-5)
-
-
 @settings(max_examples=300)
 @given(
     name=names,
@@ -150,16 +132,6 @@ def test_the_compiled_wheel_is_the_plain_one_and_stays_on_the_friction_circle(
 def test_finite_inputs_give_finite_forces(name, normal_n, slip_x, slip_y, slip_sinkage):
     soil = replace(load_soil(name), slip_sinkage_ratio=slip_sinkage)
     assert np.isfinite(wheel_ground(ground_record(soil, *GEOMETRY)[0], normal_n, slip_x, slip_y)).all()
-
-
-@given(name=names, slip=st.floats(1e-6, 1.0), angle_rad=st.floats(-math.pi, math.pi))
-def test_ground_is_isotropic(name, slip, angle_rad):
-    ground = ground_record(load_soil(name), *GEOMETRY)[0]
-    ahead_n = wheel_ground(ground, NORMAL_N, slip, 0.0)[0]
-    turned = wheel_ground(ground, NORMAL_N, slip * math.cos(angle_rad), slip * math.sin(angle_rad))
-    np.testing.assert_allclose(
-        turned[:2], [ahead_n * math.cos(angle_rad), ahead_n * math.sin(angle_rad)], rtol=1e-9, atol=1e-9
-    )
 
 
 @pytest.mark.parametrize(
