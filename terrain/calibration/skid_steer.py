@@ -54,8 +54,8 @@ MIN_YAW_RATE_RADPS = 0.15  #: Slower turns are as small as their errors.
 TRIMMED = 0.2  #: Part of the stretches that is left out at either end: wheels that spin, poses that jump.
 N_LAGS = round(1.0 / GRID_S)  #: That are searched to either side.
 MIN_GROUPS = 4
-#: A fifth of a sample of logs at 20 Hz: no number of runs makes an interval narrower.
-DELAY_RESOLUTION_S = 0.01
+#: Of lidar (logged at 10 Hz) and wheels (20 Hz): by which the peak between samples is off at some phase of the grid.
+LIDAR_RESOLUTION_S, WHEELS_RESOLUTION_S = 0.004, 0.0015
 #: Of squares of yaw rates in rad^2/s^2, over a run: less are no turns, and show no delay.
 MIN_TURN_SUM = 0.5
 RADIUS, TRACK = "identified.rolling_radius_m", "identified.effective_track_m"
@@ -127,7 +127,6 @@ def identify(runs: Sequence[RunLog], wheel_radius_m: float, hard: Sequence[str])
         f"slip of {100 * low:g} to {100 * high:g} % assumed in straight driving on {where}: only the radius "
         "less the slip is to be seen"
     )
-    delays = "runs", DELAY_RESOLUTION_S, behind
     rows: list[tuple[str, Callable[[Sequence[Driven]], tuple[float, int]], str, float, str]] = [
         (
             RADIUS,
@@ -137,8 +136,8 @@ def identify(runs: Sequence[RunLog], wheel_radius_m: float, hard: Sequence[str])
             assumed,
         ),
         (TRACK, track, "steady stretches", 0.0, f"skidding included, by the described radius, on {where}"),
-        (LIDAR_DELAY, partial(best_lag, 0), *delays),
-        (WHEELS_DELAY, partial(best_lag, 1), *delays),
+        (LIDAR_DELAY, partial(best_lag, 0), "runs", LIDAR_RESOLUTION_S, behind),
+        (WHEELS_DELAY, partial(best_lag, 1), "runs", WHEELS_RESOLUTION_S, behind),
     ]
     findings = [over_groups(groups, *row) for row in rows]
     return findings if any_gyro else [*findings[:3], *undetermined([WHEELS_DELAY], "there is no gyro")]

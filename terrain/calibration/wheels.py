@@ -17,7 +17,7 @@ and so do its moments about the centre of mass, with ``t_i`` along the travel of
 ``share_i`` its share of the load, ``I_i`` its current.  The common pull p against rolling resistance and
 friction is projected out.  The force b of a side slope, which looks like a zero that changes sign with the
 direction of driving, and the stiffness c are found together with the zeros: two equations a stretch, six
-unknowns, by the robust fit of :mod:`terrain.identify`, a stretch a cluster.
+unknowns, by the robust fit of :mod:`terrain.identify`.
 
 Assumed: tyres and motors that are alike, a camera square to the body, a level floor or one slope for all.
 (Danzi, AgriMaRo thesis, 3.3.1, sets the wheels straight by hand.)
@@ -154,7 +154,7 @@ def why_none(runs: Sequence[RunLog], robot: Robot, hard: Sequence[str]) -> str:
 
 
 MIN_DOF = 3  #: With fewer equations to spare, their scatter is not known.
-FIRST_ERROR_RAD, LEAST_ERROR_RAD = 0.003, 1e-9  #: Of a stretch's equations, by which outliers weigh less.
+FIRST_ERROR_RAD, LEAST_ERROR_RAD = 0.003, 1e-9  #: Of an equation, by which outliers weigh less.
 #: Of a driven wheel in steady driving on hard ground: a rolling resistance of 0.01 to 0.02 of the load over a slip
 #: stiffness of 10 to 20 loads.
 SLIP_RATIO = (0.0, 0.002)
@@ -185,13 +185,16 @@ def steering_zeros(stretches: Sequence[Steady], robot: Robot) -> list[Finding]:
             _balance(stretch, np.angle(np.exp(1j * (stretch.off_rad - about))), robot)
             for stretch in stretches
         ]
-        rows, seen = (np.array(part) for part in zip(*balances, strict=True))
-        flat = rows.reshape(-1, len(UNKNOWNS))
-        if np.linalg.cond(flat / np.linalg.norm(flat, axis=0)) < 1e6:
-            clusters, scale = np.arange(len(stretches)), (FIRST_ERROR_RAD, LEAST_ERROR_RAD)
-            fit = identify(lambda x: rows @ x - seen, UNKNOWNS, clusters, True, scale=scale)
+        rows, seen = (np.concatenate(part) for part in zip(*balances, strict=True))
+        if np.linalg.cond(rows / np.linalg.norm(rows, axis=0)) < 1e6:
+            fit = identify(
+                lambda x: rows @ x - seen, UNKNOWNS, robust=True, scale=(FIRST_ERROR_RAD, LEAST_ERROR_RAD)
+            )
+            # of stretches so few each weighs too much to be left out: the scatter is that of all equations
+            squares = fit.residual**2 / np.sqrt(1.0 + fit.residual**2)
+            std = fit.std[:3] * math.sqrt(squares.sum() / n_spare)
             step_rad = 2 * math.pi / robot.equipment.sensors.steering_steps_ratio
-            half = half_width(fit.std[:3], n_spare, bounded=step_rad / 2)
+            half = half_width(std, n_spare, bounded=step_rad / 2)
             if half.max() <= robot.equipment.steering.dead_band_rad:
                 zero, runs = (
                     np.angle(np.exp(1j * (about + fit.value[:3]))),
@@ -220,9 +223,8 @@ def _balance(stretch: Steady, slip_rad: Array, robot: Robot) -> tuple[Array, Arr
         return np.vstack([force.T, (arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]) / length_m])
 
     across, along = wrench(share[:, None] * left), wrench(stretch.travel)
-    apart = np.linalg.svd(along.sum(axis=1)[None, :])[2][
-        1:
-    ]  # two directions to which the common pull adds nothing
+    # two directions to which the common pull adds nothing
+    apart = np.linalg.svd(along.sum(axis=1)[None, :])[2][1:]
     rows = np.column_stack([across, -along @ stretch.current_a, np.eye(3)[:, :2]])
     return apart @ rows, apart @ across @ slip_rad
 

@@ -21,7 +21,6 @@ from pipelines.report.tree import Column, Report, Table
 from terrain.calibration.description import findings_of
 from terrain.calibration.odometry import SLIP, fit_odometry, legs_of_poses, level
 from terrain.calibration.sensors import fit_gravity
-from terrain.calibration.skid_steer import DELAY_RESOLUTION_S
 from terrain.calibration.skid_steer import SLIP_RATIO as RADIUS_SLIP_RATIO
 from terrain.calibration.skid_steer import identify as identify_skid
 from terrain.calibration.wheels import SLIP_RATIO
@@ -258,20 +257,13 @@ def _swerve(seed: int) -> Iterator[Interval]:
 
 
 def _skid_steer(seed: int) -> Iterator[Interval]:
-    """A robot whose wheels slip as is assumed, and whose delays are off by up to their resolution."""
-    rng, radius_m, track_m = np.random.default_rng(seed), 0.29, 1.8
-    hidden = {
-        "rolling_radius_m": radius_m,
-        "effective_track_m": track_m,
-        "lidar_delay_s": 0.3,
-        "wheels_delay_s": 0.05,
-    }
-    late = np.array([0.3, 0.05]) + rng.uniform(-DELAY_RESOLUTION_S, DELAY_RESOLUTION_S, 2)
-    slip = rng.uniform(*RADIUS_SLIP_RATIO)
-    runs = [skid_run(radius_m, track_m, *late, 1000 * seed + k, slip=slip, n_steps=4) for k in range(8)]
-    for finding in identify_skid(runs, NOMINAL_M, ("asphalt",)):
-        name = finding.parameter.partition(".")[2]
-        yield Interval(name, finding.low, finding.high, hidden[name])
+    """A robot whose wheels slip as is assumed, and whose delays lie anywhere between samples."""
+    rng = np.random.default_rng(seed)
+    lidar_s, wheels_s = np.array([0.3, 0.05]) + rng.uniform(0.0, 0.05, 2)
+    slip, hidden = rng.uniform(*RADIUS_SLIP_RATIO), (0.29, 1.8, lidar_s, wheels_s)
+    runs = [skid_run(*hidden, 1000 * seed + k, slip=slip, n_steps=4) for k in range(8)]
+    for finding, truth in zip(identify_skid(runs, NOMINAL_M, ("asphalt",)), hidden, strict=True):
+        yield Interval(finding.parameter.partition(".")[2], finding.low, finding.high, truth)
 
 
 def _soil(seed: int) -> Iterator[Interval]:
