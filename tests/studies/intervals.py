@@ -229,20 +229,13 @@ def _six_positions(seed: int) -> Iterator[Interval]:
 
 
 def _swerve(seed: int) -> Iterator[Interval]:
-    """A robot whose zeros are off by up to half a step of their encoders, and whose wheels slip as is assumed."""
-    rng, soil, step_rad = (
-        np.random.default_rng(seed),
-        SOILS["tiles"],
-        2 * np.pi / HIDDEN.sensors.steering_steps_ratio,
-    )
-    zeros = {
-        f"zero_{i}_rad": zero + step_rad * rng.uniform(-0.5, 0.5)
-        for i, zero in enumerate(HIDDEN.steering_zeros_rad, 1)
-    }
-    own_slip = soil.rolling_resistance_ratio / (
-        soil.stiffness_ratio * soil.shape_ratio * soil.peak_friction_ratio
-    )
-    ratio = HIDDEN.motors.reduction_ratio * (1 - own_slip) / (1 - rng.uniform(*SLIP_RATIO))
+    """A robot whose zeros are off by up to half a step of their encoders, and wheels that slip as is assumed."""
+    rng, soil, steps = np.random.default_rng(seed), SOILS["tiles"], HIDDEN.sensors.steering_steps_ratio
+    off_rad = 2 * np.pi / steps * rng.uniform(-0.5, 0.5, 3)
+    zeros = {f"zero_{i}_rad": zero for i, zero in enumerate(HIDDEN.steering_zeros_rad + off_rad, start=1)}
+    shear = soil.stiffness_ratio * soil.shape_ratio * soil.peak_friction_ratio
+    own_slip, slip = soil.rolling_resistance_ratio / shear, rng.uniform(*SLIP_RATIO)
+    ratio = HIDDEN.motors.reduction_ratio * (1 - own_slip) / (1 - slip)
     robot = HIDDEN.with_parts(
         steering=replace(HIDDEN.steering, **zeros), motors=replace(HIDDEN.motors, reduction_ratio=ratio)
     )
