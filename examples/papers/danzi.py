@@ -870,15 +870,15 @@ def printed_step(
     slip, _ = conditioned_slip(rate, speed, LOW_SPEED_MPS)
     drive_state = power_state(accel, speed, POWER_THRESHOLD_WPKG)
     desired = desired_slip(drive_state, float(np.sign(speed)), TARGETS)
-    added, pid, _ = pid_step(Gains(gain, 0.0, 0.0, limit=10.0), state.pid, desired - slip, 0.02)
-    return added, desired, WheelPid(pid)
+    added, integral, _ = pid_step(Gains(gain, 0.0, limit=10.0), state.integral, desired - slip, 0.02)
+    return added, desired, WheelPid(integral)
 
 
 def normalised_step(
     state: WheelPid, gain: float, rate: float, speed: float, accel: float
 ) -> tuple[float, float, WheelPid]:
     """Return what the controller of this package does, by which an error is worth the same at any speed."""
-    gains = Gains(gain, 0.0, 0.0, limit=10.0)
+    gains = Gains(gain, 0.0, limit=10.0)
     step, after = wheel_step(gains, 1.0, state, rate, rate, speed, accel, abs(speed), TARGETS, 0.02)
     return step.correction_radps, step.desired_ratio, after
 

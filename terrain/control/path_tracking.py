@@ -39,7 +39,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from terrain.angles import wrapped
-from terrain.control.pid import LONGEST_STEP_S, Gains, PidState, PidStatus, pid_step
+from terrain.control.pid import LONGEST_STEP_S, Gains, pid_step
 from terrain.control.stability import DELAY_S, SAMPLE_TIME_S, closed_loop
 from terrain.errors import ConfigError
 from terrain.records import Array
@@ -280,12 +280,11 @@ def track_step(
     for value, before, loop in zip(error.tolist(), integral, ("cross", "cross", "heading"), strict=True):
         k, k_i, limit, fastest = loops[loop]
         slower = min(1.0, fastest / max(k * size, 1e-9))
-        gains = Gains(slower * k, slower * k_i, 0.0, limit, limit, 0.0)
-        one, pid, computed = pid_step(gains, PidState(before), -value, min(size * dt_s, LONGEST_STEP_S))
+        gains, distance_m = Gains(slower * k, slower * k_i, limit, limit), min(size * dt_s, LONGEST_STEP_S)
+        one, grown, is_clamped = pid_step(gains, before, -value, distance_m)
         added.append(one)
-        integrals.append(pid.integral)
-        if computed is not PidStatus.OK:
-            status = TrackStatus.CLAMPED
+        integrals.append(grown)
+        status = TrackStatus.CLAMPED if is_clamped else status
     correction = _across(np.array(added), along)
     cross_m = math.copysign(math.hypot(error[0], error[1]), along[0] * error[1] - along[1] * error[0])
     angle = math.sqrt(correction @ correction)

@@ -1,14 +1,11 @@
 """PID control: one pure step, and the controller of Danzi, AgriMaRo thesis, chapter 8, on the slip of each wheel.
 
-(8.2) in steps of dt::
+(8.2) in steps of dt, with K_D = 0: a derivative of estimated slip is mostly noise::
 
-    I' = I + K_I e dt                         d = (x' - x) / dt,  x' = x + (1 - exp(-dt / tau)) (e - x)
-    u = clip(K_P e + I' + K_D d, -limit, limit)
+    I' = I + K_I e dt        u = clip(K_P e + I', -limit, limit)
 
-The thesis specifies neither anti-windup nor a clamp nor a filter on the derivative.  Here integration is
-conditional: the integral is kept while the sum is beyond the limit and the error would drive it further.  The
-derivative is that of the low-pass filtered error (time constant tau); it is zero at the first error and at
-the first after a gap.
+The thesis specifies neither anti-windup nor a clamp.  Here integration is conditional: the integral is kept while
+the sum is beyond the limit and the error would drive it further.
 
 On a wheel with radius r, rate w and ground speed v along it:
 
@@ -72,7 +69,7 @@ def checked(
 
     Examples
     --------
-    >>> checked("gain ", Gains(1, -1, 0, limit=2))
+    >>> checked("gain ", Gains(1, -1, limit=2))
     Traceback (most recent call last):
     terrain.errors.ConfigError: gain ki is -1, a number from zero up is required
     """
@@ -94,67 +91,35 @@ def checked(
 LONGEST_STEP_S = 0.5
 
 
-class PidStatus(StatusCode):
-    """Result of a step: computed, computed and clamped to the limit, or no valid time step or error."""
-
-    OK = 0
-    CLAMPED = 1
-    BAD_TIME = 2
-    NO_ERROR = 3
-
-
 class Gains(NamedTuple):
     """Gains and limits of a controller; output and limits have the same unit."""
 
     kp: float  #: output per error
     ki: float  #: per error and second
-    kd: float  #: per rate of error
     limit: float  #: largest magnitude of the output
     integral_limit: float = math.inf  #: of the integral; infinite where ``limit`` is sufficient
-    #: of the error's low-pass before it is differentiated; 0 for none
-    derivative_time_constant_s: float = 0.0
 
 
-class PidState(NamedTuple):
-    """State of a controller: its integral, in units of the output, and the filtered error or NaN."""
-
-    integral: float = 0.0
-    error: float = math.nan
-
-
-def pid_step(gains: Gains, state: PidState, error: float, dt_s: float) -> tuple[float, PidState, PidStatus]:
-    """Return output, next state and status of one step.
+def pid_step(gains: Gains, integral: float, error: float, dt_s: float) -> tuple[float, float, bool]:
+    """Return the output of one step, the next integral in its unit, and whether the output is clamped.
 
     Without an error (NaN or infinite), or with a time step that is not above 0 and up to
-    :data:`LONGEST_STEP_S`, the output is 0, the integral is kept, and the memory of the error is dropped.
+    :data:`LONGEST_STEP_S`, the output is 0 and the integral is kept.
 
     Examples
     --------
-    >>> gains = Gains(kp=1.0, ki=0.5, kd=0.0, limit=1.0)
-    >>> pid_step(gains, PidState(), 0.4, 0.1)[:2]
-    (0.42000000000000004, PidState(integral=0.020000000000000004, error=0.4))
-    >>> output, state, status = pid_step(gains, PidState(), 2.0, 0.1)
-    >>> output, state.integral, status.label
-    (1.0, 0.0, 'clamped')
+    >>> gains = Gains(kp=1.0, ki=0.5, limit=1.0)
+    >>> pid_step(gains, 0.0, 0.4, 0.1), pid_step(gains, 0.0, 2.0, 0.1)
+    ((0.42000000000000004, 0.020000000000000004, False), (1.0, 0.0, True))
     """
-    if not 0.0 < dt_s <= LONGEST_STEP_S:
-        return 0.0, PidState(state.integral, math.nan), PidStatus.BAD_TIME
-    if not math.isfinite(error):
-        return 0.0, PidState(state.integral, math.nan), PidStatus.NO_ERROR
-    smooth, rate = error, 0.0
-    if not math.isnan(state.error):
-        tau_s = gains.derivative_time_constant_s
-        change = (error - state.error) * (-math.expm1(-dt_s / tau_s) if tau_s > 0.0 else 1.0)
-        smooth, rate = state.error + change, change / dt_s
-    without = gains.kp * error + gains.kd * rate
-    integral = state.integral + gains.ki * error * dt_s
-    integral = min(max(integral, -gains.integral_limit), gains.integral_limit)
-    if abs(without + integral) > gains.limit and (without + integral) * error > 0.0:
-        integral = state.integral
-    desired = without + integral
+    if not (0.0 < dt_s <= LONGEST_STEP_S and math.isfinite(error)):
+        return 0.0, integral, False
+    grown = min(max(integral + gains.ki * error * dt_s, -gains.integral_limit), gains.integral_limit)
+    desired = gains.kp * error + grown
+    if abs(desired) > gains.limit and desired * error > 0.0:
+        grown, desired = integral, gains.kp * error + integral
     output = min(max(desired, -gains.limit), gains.limit)
-    status = PidStatus.OK if output == desired else PidStatus.CLAMPED
-    return output, PidState(integral, smooth), status
+    return output, grown, output != desired
 
 
 class DriveState(StatusCode):
@@ -177,36 +142,23 @@ POWER_THRESHOLD_WPKG = 0.1
 LOW_SPEED_MPS = 0.05
 
 
-class ThesisStatus(StatusCode):
-    """Result of a step of a wheel: those of its PID, and three in which its error is not used.
-
-    ``LOW_SPEED``: the error counts as 0.  ``STANDING``, ``REVERSING``: nothing is added, as the robot is at
-    rest, or as the wheel rolls against its command or has had none yet.
-    """
-
-    OK = PidStatus.OK
-    CLAMPED = PidStatus.CLAMPED
-    BAD_TIME = PidStatus.BAD_TIME
-    NO_ERROR = PidStatus.NO_ERROR
-    LOW_SPEED = 4
-    STANDING = 5
-    REVERSING = 6
-
-
 class WheelPid(NamedTuple):
-    """State of a wheel: its PID, and the direction of its command; 0 before there was one."""
+    """State of a wheel: the integral of its PID, and the direction of its command; 0 before there was one."""
 
-    pid: PidState = PidState()
+    integral: float = 0.0
     direction: float = 0.0
 
 
 class WheelStep(NamedTuple):
-    """What a step gives a wheel."""
+    """What a step gives a wheel.
 
-    correction_radps: float  #: to add to its command; 0 by every status but ok, clamped and low speed
+    Its correction is 0 where an input or the time is not valid, the robot stands, or the wheel rolls against its
+    command or has had none yet.
+    """
+
+    correction_radps: float  #: to add to its command
     desired_ratio: float  #: signed along the wheel; NaN where the drive state or the target is unknown
     drive_state: DriveState
-    status: ThesisStatus
 
 
 def conditioned_slip(wheel_speed_mps: float, speed_mps: float, low_speed_mps: float) -> tuple[float, float]:
@@ -277,30 +229,20 @@ def wheel_step(
     Forward in traction with too much slip: case 1A of table 8.1, with a radius of 1 m.
 
     >>> given = WheelPid(), 0.7, 0.7, 0.6, 1.0, 0.6, (0.1, -0.15, 0.05), 0.02
-    >>> wheel, _ = wheel_step(Gains(1.0, 0.0, 0.0, limit=1.0), 1.0, *given)
+    >>> wheel, _ = wheel_step(Gains(1.0, 0.0, limit=1.0), 1.0, *given)
     >>> round(wheel.correction_radps, 3), wheel.desired_ratio
     (-0.03, 0.1)
     """
-    integral, direction = state.pid.integral, state.direction
+    integral, direction = state
     reference = command_radps * radius_m
     if abs(reference) > LOW_SPEED_MPS and reference * direction <= 0.0:
         direction, integral = math.copysign(1.0, reference), 0.0
     slip, fastest = conditioned_slip(wheel_radps * radius_m, speed_mps, LOW_SPEED_MPS)
     drive_state = power_state(accel_mps2, speed_mps, POWER_THRESHOLD_WPKG)
-    desired = desired_slip(drive_state, direction, target_ratio)
+    desired, added = desired_slip(drive_state, direction, target_ratio), 0.0
     error, slow = desired - slip, abs(speed_mps) < LOW_SPEED_MPS
-    status = None
-    if not 0.0 < dt_s <= LONGEST_STEP_S:
-        status = ThesisStatus.BAD_TIME
-    elif not math.isfinite(error) or math.isnan(chassis_speed_mps):
-        status = ThesisStatus.NO_ERROR
-    elif chassis_speed_mps <= LOW_SPEED_MPS:
-        status = ThesisStatus.STANDING
-    elif not slow and speed_mps * direction <= 0.0:
-        status = ThesisStatus.REVERSING
-    if status is not None:
-        return WheelStep(0.0, desired, drive_state, status), WheelPid(PidState(integral), direction)
-    error = 0.0 if slow else error * (fastest / radius_m)
-    added, pid, computed = pid_step(gains, PidState(integral, state.pid.error), error, dt_s)
-    status = ThesisStatus.LOW_SPEED if slow else ThesisStatus(computed)
-    return WheelStep(added, desired, drive_state, status), WheelPid(pid, direction)
+    rolls_on = slow or speed_mps * direction > 0.0
+    if rolls_on and math.isfinite(error) and chassis_speed_mps > LOW_SPEED_MPS:
+        error = 0.0 if slow else error * (fastest / radius_m)
+        added, integral, _ = pid_step(gains, integral, error, dt_s)
+    return WheelStep(added, desired, drive_state), WheelPid(integral, direction)

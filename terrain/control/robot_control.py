@@ -72,7 +72,7 @@ from terrain.slip import MIN_SPEED_MPS
 CONTROLLERS = ("plain", "ramp", "thesis", "traction")
 OPEN_LOOP = ("plain", "ramp")  #: Controllers that use no measurement.
 #: The thesis specifies none; these have a gain margin of 3 on the simulated robot (``check_stable``).
-THESIS_GAINS = Gains(0.5, 0.5, 0.0, limit=2.0)
+THESIS_GAINS = Gains(0.5, 0.5, limit=2.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -71,18 +71,18 @@ def check_stable(
     --------
     >>> from terrain.robots import load_robot
     >>> robot = load_robot("agrimaro")
-    >>> round(check_stable(robot, Gains(0.5, 0.5, 0.0, limit=5.0)), 1)
+    >>> round(check_stable(robot, Gains(0.5, 0.5, limit=5.0)), 1)
     3.0
-    >>> check_stable(robot, Gains(2.0, 0.0, 0.0, limit=5.0))
+    >>> check_stable(robot, Gains(2.0, 0.0, limit=5.0))
     Traceback (most recent call last):
-    terrain.errors.ConfigError: robot agrimaro: slip control (kp 2, ki 0, kd 0) with a delay of 0.05 s is
+    terrain.errors.ConfigError: robot agrimaro: slip control (kp 2, ki 0) with a delay of 0.05 s is
     unstable from 0.05 to 2 m/s; it is stable up to 0.76 times these gains
     """
     fastest_mps = robot.wheel_radius_m * robot.equipment.motors.speed_max_radps
     speeds_mps = np.geomspace(LOW_SPEED_MPS, fastest_mps, N_SPEEDS).tolist()
     places = list(product(speeds_mps, SLIPS, SLOPES))
     without, loops = (
-        loop_matrices(robot, one, delay_s, places) for one in (gains._replace(kp=0.0, ki=0.0, kd=0.0), gains)
+        loop_matrices(robot, one, delay_s, places) for one in (gains._replace(kp=0.0, ki=0.0), gains)
     )
 
     def radii(factor: float) -> Array:  # with all gains scaled: the matrix is linear in them
@@ -97,7 +97,7 @@ def check_stable(
     unstable = [place[0] for place, radius in zip(places, radii(1.0), strict=True) if radius >= 1.0]
     if unstable:
         raise ConfigError(
-            f"robot {robot.name}: slip control (kp {gains.kp:g}, ki {gains.ki:g}, kd {gains.kd:g}) "
+            f"robot {robot.name}: slip control (kp {gains.kp:g}, ki {gains.ki:g}) "
             f"with a delay of {delay_s:g} s is unstable from {min(unstable):.3g} to {max(unstable):.3g} m/s; "
             f"it is stable up to {margin:.2g} times these gains"
         )
@@ -152,17 +152,16 @@ def loop_matrices(
         )
         systems.append(rows)
     plants = expm(np.array(systems) * dt_s)
-    *_, measured_slip, integral, filtered = np.eye(9)
-    tau_s, loops = gains.derivative_time_constant_s, []
+    *_, measured_slip, integral = np.eye(8)
+    loops = []
     for (speed_mps, slip_ratio, _), plant in zip(places, plants, strict=True):
         error = -measured_slip * (speed_mps / radius_m)
-        change = (error - filtered) * (-math.expm1(-dt_s / tau_s) if tau_s > 0 else 1.0)
-        controller = np.array([integral + gains.ki * dt_s * error, filtered + change])
-        output = gains.kp * error + controller[0] + gains.kd / dt_s * change
+        controller = np.array([integral + gains.ki * dt_s * error])
+        output = gains.kp * error + controller[0]
         loop = closed_loop(plant[:-1, :-1], plant[:-1, -1], controller, output, n_delayed)
         rolls = radius_m * (1 - slip_ratio) if slip_ratio > 0 else radius_m / (1 + slip_ratio)
         # The speeds of wheel and robot, the estimate and commands shift together.
-        together = np.array([1.0, rolls, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, *np.ones(n_delayed)])
+        together = np.array([1.0, rolls, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, *np.ones(n_delayed)])
         # The loop on the complement of the direction that it maps to itself: its other eigenvalues.
         across = np.linalg.svd(together[None])[2][1:]
         loops.append(across @ loop @ across.T)

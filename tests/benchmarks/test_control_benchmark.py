@@ -21,7 +21,7 @@ N_STEPS = 2000
 MOST_US = {"traction": 60.0, "thesis": 60.0}  #: Of a step: three thousandths of a period of 20 ms
 MOST_PILOT_US = 300.0  #: Of a whole step of the chain: a part in 70 of its period
 ROBOT = load_robot("agrimaro")
-GAINS = Gains(0.5, 0.5, 0.0, 2.0)
+GAINS = Gains(0.5, 0.5, 2.0)
 DT_S = 0.02
 
 

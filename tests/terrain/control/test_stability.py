@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.pid import Gains, PidState, pid_step
+from terrain.control.pid import Gains, pid_step
 from terrain.control.stability import DELAY_S, SLOPES, check_stable, loop_matrices
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
@@ -26,7 +26,7 @@ def critical_gain(delay_s, *where):
     low, high = 1e-3, 1e3
     while high / low > 1.0001:
         middle = math.sqrt(low * high)
-        gains = Gains(middle, 0.0, 0.0, 1.0)
+        gains = Gains(middle, 0.0, 1.0)
         stable = spectral_radius(loop_matrices(ROBOT, gains, delay_s, [where])[0]) < 1
         low, high = (middle, high) if stable else (low, middle)
     return low
@@ -59,7 +59,7 @@ def small_changes(gains, n_delayed, speed_mps, slip_ratio, slope_ratio, n_sample
             ]
         )
 
-    x, pid, queue, found = np.array([0.01, 0, 0, 0, 0, 0, 0.0]), PidState(0.0, 0.0), [0.0] * n_delayed, []
+    x, pid, queue, found = np.array([0.01, 0, 0, 0, 0, 0, 0.0]), 0.0, [0.0] * n_delayed, []
     steps = 40
     for _ in range(n_samples):
         error = -x[6] * speed_mps / RADIUS_M
@@ -76,15 +76,14 @@ def small_changes(gains, n_delayed, speed_mps, slip_ratio, slope_ratio, n_sample
 @pytest.mark.parametrize(
     ("numbers", "n_delayed", "where"),
     [
-        ((3.5, 1.0, 0.0, 0.0), 3, (1.0, 0.13, 0.6)),
-        ((2.0, 0.5, 0.0, 0.0), 2, (0.2, -0.2, 0.1)),
-        ((6.0, 0.0, 0.08, 0.1), 0, (0.05, 0.2, 0.3)),
-        ((4.0, 4.0, 0.1, 0.05), 1, (0.1, 0.2, 3.0)),
+        ((3.5, 1.0), 3, (1.0, 0.13, 0.6)),
+        ((2.0, 0.5), 2, (0.2, -0.2, 0.1)),
+        ((6.0, 0.0), 0, (0.05, 0.2, 0.3)),
+        ((4.0, 4.0), 1, (0.1, 0.2, 3.0)),
     ],
 )
 def test_a_small_change_grows_or_decays_by_the_largest_eigenvalue(numbers, n_delayed, where):
-    kp, ki, kd, tau_s = numbers
-    gains = Gains(kp, ki, kd, MOST_RADPS, derivative_time_constant_s=tau_s)
+    gains = Gains(*numbers, MOST_RADPS)
     matrix = loop_matrices(ROBOT, gains, n_delayed * DT_S, [where])[0]
     slip = np.abs(small_changes(gains, n_delayed, *where, 500))
     early, late = slip[150:250].max(), slip[400:500].max()  # a hundred samples hold a whole swing
@@ -97,7 +96,7 @@ def test_the_margin_is_the_same_at_any_speed():
     least = [min(critical_gain(DELAY_S, speed, -0.2, slope) for slope in SLOPES) for speed in speeds]
     assert least == pytest.approx([1.53] * 3, rel=0.02)
     assert np.multiply(least, speeds) / RADIUS_M == pytest.approx([0.38, 3.8, 15.3], rel=0.02)
-    margin = check_stable(ROBOT, Gains(0.19, 0.0, 0.0, 5.0))
+    margin = check_stable(ROBOT, Gains(0.19, 0.0, 5.0))
     assert margin == pytest.approx(min(least) / 0.19, rel=0.01)
 
 
@@ -105,7 +104,7 @@ def test_the_margin_is_the_same_at_any_speed():
     ("arguments", "message"),
     [
         (
-            {"gains": Gains(2.0, 0.0, 0.0, 5.0)},
+            {"gains": Gains(2.0, 0.0, 5.0)},
             r"unstable from 0\.05 to 2 m/s; it is stable up to 0\.76 times",
         ),
         ({"delay_s": math.nan}, "^delay_s is nan, 0 to 1 s is required"),
@@ -115,5 +114,5 @@ def test_the_margin_is_the_same_at_any_speed():
 )
 def test_an_unstable_loop_or_bad_input_is_refused_in_one_sentence(arguments, message):
     with pytest.raises(ConfigError, match=message) as refused:
-        check_stable(**{"robot": ROBOT, "gains": Gains(1.0, 0.0, 0.0, 5.0)} | arguments)
+        check_stable(**{"robot": ROBOT, "gains": Gains(1.0, 0.0, 5.0)} | arguments)
     assert "\n" not in str(refused.value)
