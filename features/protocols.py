@@ -19,7 +19,6 @@ from sklearn.model_selection import StratifiedKFold
 from features.motion import fastest_wheel
 from features.windows import (
     TIME_TOLERANCE_S,
-    WindowCut,
     WindowRule,
     cut_windows,
     label_windows,
@@ -218,43 +217,6 @@ def folds_of(samples: Samples, protocol: str = "grouped", repeats: int = 1, seed
     ]
 
 
-def cut_partitions(
-    runs: Sequence[RunLog], rule: WindowRule, signal_sets: Iterable[str] = SIGNAL_SETS
-) -> tuple[WindowCut, Array]:
-    """Cut windows as the papers do, and name the partition (n,) of each: slid inside 5 s, classes balanced by stride.
-
-    The class with the fewest partitions is cut every 0.1 s, the others in proportion to their number.
-    No rule of steady motion is applied.
-    """
-    if rule.length_s > PARTITION_S:
-        raise ConfigError(
-            f"a window of {rule.length_s:g} s does not fit into a partition of {PARTITION_S:g} s"
-        )
-    layout = layout_of(runs, signal_sets, speeds=False)
-    begin_s = {run.run_id: span_of(run, layout)[0] for run in runs}
-    places = []
-    for run in runs:
-        starts = regular_starts(*span_of(run, layout), PARTITION_S, PARTITION_S)
-        labels = label_windows(run, starts, PARTITION_S)
-        places += [(run.run_id, name, start) for start, name in zip(starts, labels, strict=True) if name]
-    if not places:
-        raise DataError(f"no partition of {PARTITION_S:g} s lies under one label")
-    names, counts = np.unique(np.array([place[1] for place in places]), return_counts=True)
-    stride_s = dict(zip(names, PUBLISHED_STRIDE_S * counts / counts.min(), strict=True))
-    starts_s: dict[str, list[float]] = {}
-    for run_id, name, start in places:
-        inside = regular_starts(start, start + PARTITION_S, rule.length_s, stride_s[name])
-        starts_s.setdefault(run_id, []).extend(inside)
-    plain = WindowRule(rule.length_s, rule.stride_s, None)
-    at = {run_id: np.array(each) for run_id, each in starts_s.items()}
-    cut = labelled(cut_windows(runs, plain, layout=layout, starts_s=at, skip_short=True))
-    partition = [
-        f"{run_id} part {int((start - begin_s[run_id] + TIME_TOLERANCE_S) // PARTITION_S)}"
-        for start, run_id in zip(cut.windows.start_s, cut.windows.run_id, strict=True)
-    ]
-    return cut, np.array(partition, dtype=object)
-
-
 def samples_of(
     runs: Sequence[RunLog],
     rule: WindowRule,
@@ -284,11 +246,39 @@ def samples_of(
         if not runs:
             raise DataError(f"no run is driven at a speed of {speed_mps[0]:g} to {speed_mps[1]:g} m/s")
     distinct, merged = distinct_runs(runs, merge=merge_duplicates)
-    if protocol == "published":
-        cut, group = cut_partitions(distinct, rule, signal_sets)
-        gap = 0
+    is_published = protocol == "published"
+    if is_published and rule.length_s > PARTITION_S:
+        raise ConfigError(
+            f"a window of {rule.length_s:g} s does not fit into a partition of {PARTITION_S:g} s"
+        )
+    layout = layout_of(distinct, signal_sets, speeds=rule.steady is not None and not is_published)
+    if is_published:
+        # slid inside partitions of 5 s, that with the fewest of a class every 0.1 s, the others in proportion to their
+        # number, so that classes are balanced; no rule of steady motion is applied
+        begin_s = {run.run_id: span_of(run, layout)[0] for run in distinct}
+        places = []
+        for run in distinct:
+            starts = regular_starts(*span_of(run, layout), PARTITION_S, PARTITION_S)
+            labels = label_windows(run, starts, PARTITION_S)
+            places += [(run.run_id, name, start) for start, name in zip(starts, labels, strict=True) if name]
+        if not places:
+            raise DataError(f"no partition of {PARTITION_S:g} s lies under one label")
+        names, counts = np.unique(np.array([place[1] for place in places]), return_counts=True)
+        each_s = dict(zip(names, PUBLISHED_STRIDE_S * counts / counts.min(), strict=True))
+        starts_s: dict[str, list[float]] = {}
+        for run_id, name, start in places:
+            inside = regular_starts(start, start + PARTITION_S, rule.length_s, each_s[name])
+            starts_s.setdefault(run_id, []).extend(inside)
+        at = {run_id: np.array(each) for run_id, each in starts_s.items()}
+        plain = WindowRule(rule.length_s, rule.stride_s, None)
+        cut = labelled(cut_windows(distinct, plain, layout=layout, starts_s=at, skip_short=True))
+        windows, gap = cut.windows, 0
+        partition = [
+            f"{run_id} part {int((start - begin_s[run_id] + TIME_TOLERANCE_S) // PARTITION_S)}"
+            for start, run_id in zip(windows.start_s, windows.run_id, strict=True)
+        ]
+        group: Array = np.array(partition, dtype=object)
     else:
-        layout = layout_of(distinct, signal_sets, speeds=rule.steady is not None)
         cut = labelled(cut_windows(distinct, rule, layout=layout, skip_short=skip_short))
         group, gap = cut.windows.run_id, rule.overlap
     values = cut.windows.values

@@ -27,7 +27,7 @@ TOLERANCE_S = 0.5  #: A stretch of a table may be that far outside of its run, a
 YES, NONE = "yes", "none"
 
 
-def smoothed_classes(probability: Array, time_s: Array, prior: Array, dwell_s: float = DWELL_S) -> Array:
+def smoothed_classes(probability: Array, time_s: Array, prior: Array) -> Array:
     """Return the class (n,) of each window along the most likely sequence, of windows that do not overlap, in order.
 
     Maximises ``sum_i log((1 - o) p_i(c_i) / prior(c_i) + o) + sum_i log P(c_i | c_i-1, dt_i)`` with the share
@@ -40,7 +40,7 @@ def smoothed_classes(probability: Array, time_s: Array, prior: Array, dwell_s: f
     evidence = np.log((1.0 - OUTLIER_RATIO) * probability / prior + OUTLIER_RATIO)
     score, origin = evidence[0].copy(), np.zeros((n, k), dtype=int)
     for i in range(1, n):
-        kept = np.exp(-max(float(time_s[i] - time_s[i - 1]), 0.0) / dwell_s)
+        kept = np.exp(-max(float(time_s[i] - time_s[i - 1]), 0.0) / DWELL_S)
         step = np.full((k, k), np.log((1.0 - kept) / max(k - 1, 1) + 1e-300))
         np.fill_diagonal(step, np.log(kept + 1e-300))
         reached = score[:, None] + step

@@ -387,25 +387,6 @@ def mean_interval(values: Sequence[float]) -> MeanInterval:
     return MeanInterval(mean, ci, n)
 
 
-def paired_difference(
-    values: Sequence[float | None], base: Sequence[float | None], relative: bool
-) -> Difference | None:
-    """Return the mean of ``values - base``, pair by pair; None without a pair of which both are known.
-
-    Relative to the mean of ``base``, which then has to be above zero.
-    """
-    pairs = np.array([values, base], dtype=float).T
-    pairs = pairs[np.isfinite(pairs).all(axis=1)]
-    if not len(pairs):
-        return None
-    scale = float(pairs[:, 1].mean()) if relative else 1.0
-    if scale <= 0.0:
-        return None
-    mean, ci, _ = mean_interval((pairs[:, 0] - pairs[:, 1]) / scale)
-    assert mean is not None
-    return Difference(mean, *(ci or (math.nan, math.nan)))
-
-
 #: Range of the search for the steepest grade, and its bisections: to a tenth of a degree.
 STEEPEST_DEG, SLOPE_STEPS = 25.0, 9
 CLIMBING_MPS = 0.05  #: A robot that is faster than this in the last second climbs.
@@ -523,11 +504,21 @@ class Comparison:
         return self.means[name].get(key, UNKNOWN)
 
     def difference(self, name: str, other: str, key: str) -> Difference | None:
-        """Return the difference of a metric between two controllers, seed by seed; None where one has none."""
+        """Return the mean difference of a metric between two controllers, seed by seed; None where one has none.
+
+        Only seeds at which both are known count; but for :data:`ABSOLUTE` metrics it is relative to the mean of the
+        other, which then has to be above zero.
+        """
         if self.value(name, key).mean is None or self.value(other, key).mean is None:
             return None
-        values, base = ([row.get(key) for row in self.rows[one]] for one in (name, other))
-        return paired_difference(values, base, relative=key not in ABSOLUTE)
+        pairs = np.array([[row.get(key) for row in self.rows[one]] for one in (name, other)], dtype=float).T
+        pairs = pairs[np.isfinite(pairs).all(axis=1)]
+        scale = 1.0 if key in ABSOLUTE or not len(pairs) else float(pairs[:, 1].mean())
+        if not len(pairs) or scale <= 0.0:
+            return None
+        mean, ci, _ = mean_interval((pairs[:, 0] - pairs[:, 1]) / scale)
+        assert mean is not None
+        return Difference(mean, *(ci or (math.nan, math.nan)))
 
     def is_hardly_believed(self, name: str) -> bool:
         """Return whether a controller uses a classifier that was never or hardly believed.

@@ -89,10 +89,6 @@ class ReferencePath:
         """Pose at its start."""
         return float(self.x_m[0]), float(self.y_m[0]), float(self.heading_rad[0])
 
-    def with_roll(self, distance_m: Array, roll_rad: Array) -> ReferencePath:
-        """Return the path with side slopes (n,) over distance (n,), as a drive along it measured them."""
-        return replace(self, roll_rad=np.interp(self.distance_m, distance_m, roll_rad))
-
     def roll_at(self, row: int, roll_rad: float) -> float:
         """Return the side slope at a row; where it is not known, the one given."""
         assert self.roll_rad is not None
@@ -281,7 +277,8 @@ def read_path(path: Path, std_m: float = 0.0) -> ReferencePath:
         first = int(np.flatnonzero(~(np.abs(roll) < _STEEPEST_RAD))[0]) + 1
         raise DataError(f"{path}: roll_rad is beyond 45 degrees, or no number, at point {first}")
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    return reference.with_roll(along * reference.length_m / along[-1], roll)
+    along *= reference.length_m / along[-1]
+    return replace(reference, roll_rad=np.interp(reference.distance_m, along, roll))
 
 
 def _is_number(cell: str) -> bool:

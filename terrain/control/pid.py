@@ -50,7 +50,6 @@ def checked(
     what: str,
     settings: Settings,
     above_zero: Collection[str] = (),
-    unbounded: Collection[str] = (),
     most: Mapping[str, float] | None = None,
 ) -> Settings:
     """Return settings, a named tuple of numbers, as floats.
@@ -59,7 +58,7 @@ def checked(
     ----------
     what : begins a message
     settings : numbers from zero up
-    above_zero, unbounded : names of those that must not be 0, and of those that may be infinite
+    above_zero : names of those that must not be 0
     most : by name, the largest value of some
 
     Raises
@@ -81,7 +80,7 @@ def checked(
         if largest < math.inf:
             accepted = f"from 0 to {largest:g}"
         within = number > 0.0 if name in above_zero else number >= 0.0
-        if not (within and number <= largest and (name in unbounded or math.isfinite(number))):
+        if not (within and number <= largest and math.isfinite(number)):
             raise ConfigError(f"{what}{name} is {value!r}, a number {accepted} is required")
     made: Settings = named._make(map(float, settings))
     return made
