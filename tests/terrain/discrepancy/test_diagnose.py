@@ -163,14 +163,11 @@ def test_what_is_of_tracks_and_cars_is_named_with_its_value_and_nothing_beside_i
 def test_of_two_hidden_effects_both_are_named(worlds, robot, names):
     world = worlds(robot)
     hidden = {key: value for name in names for key, value in world.hidden(name).items()}
-    runs = world.runs(hidden)
-    diagnosis = diagnose(runs, world.simulation)
+    diagnosis = diagnose(world.runs(hidden), world.simulation)
     assert sorted(named(diagnosis)) == sorted(names)
     parameters, matrix = diagnosis.covariance
     assert matrix.shape == (len(parameters),) * 2
     assert set(parameters) == set(hidden) == set(diagnosis.values)
-    again = diagnose(runs, world.simulation)
-    assert json.dumps(as_json(again)) == json.dumps(as_json(diagnosis))
 
 
 def test_a_built_in_effect_is_not_found_again_and_half_of_one_is_found_by_half(worlds):
@@ -190,7 +187,8 @@ def test_an_effect_of_no_library_or_without_its_entry_is_unexplained(worlds):
     diagnosis = diagnose(world.runs({}, {"wheel_eccentricity_ratio": 0.03}), world.simulation)
     assert (diagnosis.verdict, named(diagnosis)) == (Verdict.UNEXPLAINED, [])
     assert any("wheel" in left.input for left in diagnosis.unexplained)
-    library = [effect for effect in world.simulation.library if effect.name != "motor_drift"]
+    few = ("motor_constant", "payload", "current_offset", "wheel_radius", "scrub", "viscous_drag")
+    library = [effect_named(name) for name in few]
     diagnosis = diagnose(world.runs(world.hidden("motor_drift", over=8.0)), world.simulation, library)
     assert (diagnosis.verdict, named(diagnosis)) == (Verdict.UNEXPLAINED, [])
     assert any(left.channel == "current_a" for left in diagnosis.unexplained)

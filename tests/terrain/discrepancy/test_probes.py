@@ -53,10 +53,10 @@ def test_spikes_at_random_times_are_seen_unless_the_simulation_is_known_to_lack_
 
 def test_noise_is_as_significant_as_chance_has_it(plain):
     rng, z = np.random.default_rng(6), []
-    for _ in range(8):
+    for _ in range(4):
         results = probed(with_residuals(plain, lambda _, white: rng.standard_normal(white.shape)))
         z += [result.z for (_, name), result in results.items() if "wheel" not in name]
-    # a twentieth above 1.96; inputs are alike, so that of 8 x 150 some hundreds count
+    # a twentieth above 1.96; inputs are alike, so that of 4 x 150 some hundreds count
     assert 0.02 < np.mean(np.array(z) > 1.96) < 0.09
     assert max(z) < 4.5
 
