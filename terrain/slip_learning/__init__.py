@@ -1,6 +1,7 @@
 """From measured slip and force to slip curves and target slips.
 
-``forces`` and ``samples`` compute the thrust over load at each slip of a run, ``balance`` its mass and its
-resistance; ``laws``, ``fit``, ``peak`` and ``curve`` compute the slip curve of a terrain from its runs,
-``targets`` the target slips from a curve; ``learn`` does all of it.
+``forces`` gives the thrust over load at each slip of a run, its mass and its resistance; ``curve`` the slip curve of a
+terrain from its runs, and the target slips from a curve; ``learn`` does both.  ``measured`` is slip by a motion that
+was measured from outside, ``rollers``, ``currents`` and ``ground_changes`` what follows from it; ``soil`` is for trials
+of a wheel testbed.
 """
