@@ -142,6 +142,7 @@ def travelled(run: RunLog, robot: Robot, delay_s: float = 0.0) -> Travelled:
     --------
     A quarter circle of 1 m radius to the left, in 2 s:
 
+    >>> from terrain.records import Stream
     >>> from terrain.robots import load_robot
     >>> turn = np.linspace(0.0, np.pi / 2, 21)
     >>> pose = np.column_stack([np.sin(turn), 1.0 - np.cos(turn), turn])
