@@ -1,6 +1,6 @@
 """Effects: named groups of parameters of the simulation that are 0 where the effect is absent.
 
-An entry holds all about an effect: bounds, robots, the stage where it acts, where a description has it,
+An entry holds all about an effect: bounds, robots, channels, the stage where it acts, where a description has it,
 how it is taken off samples, and its words.
 
 Signals of the formulas are those of :mod:`terrain.simulation.plants.planar`: ``u`` the speed that the wheels
@@ -198,6 +198,7 @@ class Effect(NamedTuple):
     name: str  #: as --effect and results have it
     parameters: tuple[Parameter, ...]
     drives: tuple[str, ...]  #: kinds of robots that it applies to
+    channels: tuple[str, ...]  #: where it is visible: a tenth as clearly over the noise as in the clearest
     needs: str  #: the driving that excites it
     sensed_only: bool = False  #: it changes what sensors measure, and not the motion of the body
     stage: Stage | None = None  #: where it acts in the dynamic simulation, of the robots that that simulates
@@ -468,10 +469,12 @@ _described_sensor = partial(effect, sensed_only=True, stage=Stage.DESCRIPTION)
 def _steering_offset(wheel: int) -> Effect:
     name = f"steering_offset_{wheel}"
     # d_N = measured angle + d0 (kinematics of a planar robot)
+    # wheel 3 is beside the middle, and hardly turns the robot
     return effect(
         name,
         Parameter("rad", -0.3, 0.3, 0.005),
         (SWERVE,),
+        (*MOTION, HEADING) if wheel < 3 else MOTION,
         "several speeds and standstill",
         homes=(Home("steering", f"zero_{wheel}_rad", Combine.SUBTRACTED),),
         stage=Stage.LINKAGE,
@@ -492,6 +495,7 @@ def _wheel_scale(wheel: int) -> Effect:
         name,
         Parameter("ratio", -0.2, 0.2, 0.01, as_percent=True, is_error=True),
         (SWERVE,),
+        (*MOTION, HEADING),
         "straight drives in several directions",
         inverse=Inverse(("wheels",), (f"motor_{wheel}_", f"speed_{wheel}_"), Combine.TIMES),
         stage=Stage.SENSORS,
@@ -510,6 +514,7 @@ LIBRARY: tuple[Effect, ...] = (
         "wheel_radius",
         Parameter("ratio", -0.3, 0.3, 0.01, scatter_rank=5, as_percent=True, is_error=True),
         EVERY,
+        (*MOTION, CURRENT, HEADING),
         "any speed; slopes and accelerations to part it from slip",
         homes=(Home("", "wheel_radius_m", Combine.TIMES),),
         inverse=Inverse(("wheels",), ("speed_",), Combine.TIMES),
@@ -523,6 +528,7 @@ LIBRARY: tuple[Effect, ...] = (
         "one_sided_radius",
         Parameter("ratio", -0.1, 0.1, 0.008, scatter_rank=6, as_percent=True, is_error=True),
         BOTH,
+        (*MOTION, HEADING),
         "fast and straight",
         inverse=Inverse(("wheels", "truth"), undo=_undo_one_sided_radius),
         stage=Stage.BODY,
@@ -539,6 +545,7 @@ LIBRARY: tuple[Effect, ...] = (
         "steering_backlash",
         Parameter("rad", 0.0, 0.2, 0.003, one_sided=True, deprecated=("steering_play_rad",)),
         (SWERVE, BICYCLE),
+        (*MOTION, HEADING),
         "reversals of the steering",
         inverse=Inverse(("steering",), undo=_undo_steering_backlash),
         stage=Stage.LINKAGE,
@@ -550,6 +557,7 @@ LIBRARY: tuple[Effect, ...] = (
         "steering_delay",
         Parameter("s", 0.0, 0.5, 0.01),
         (SWERVE, BICYCLE),
+        (*MOTION, HEADING),
         "steps of the steering",
         inverse=Inverse(("steering",), STAMPS, Combine.ADDED),
         stage=Stage.LINKAGE,
@@ -560,6 +568,7 @@ LIBRARY: tuple[Effect, ...] = (
         "yaw_delay",
         Parameter("s", 0.0, 0.5, 0.01),
         SKIDDING,
+        (GYRO, SPEED_Y, HEADING),
         "steps of the yaw rate",
         inverse=Inverse(("wheels",), undo=_undo_yaw_delay),
         words=_late("the robot turning"),
@@ -572,6 +581,7 @@ LIBRARY: tuple[Effect, ...] = (
         "gyro_bias",
         Parameter("radps", -0.05, 0.05, 0.001, scatter_rank=1),
         WITH_IMU,
+        (GYRO,),
         "standstill; several runs, since every power-on has a bias of its own",
         homes=(Home("sensors", "gyro_bias_z_radps", Combine.ADDED),),
         inverse=Inverse(("imu",), undo=_undo_gyro),
@@ -583,6 +593,7 @@ LIBRARY: tuple[Effect, ...] = (
         "gyro_scale",
         Parameter("ratio", -0.15, 0.15, 0.01, as_percent=True, is_error=True),
         WITH_IMU,
+        (GYRO,),
         "turns, and an absolute heading on a skid-steer robot",
         inverse=Inverse(("imu",), undo=_undo_gyro),
         twins=(("effective_track", HEADING),),
@@ -594,6 +605,7 @@ LIBRARY: tuple[Effect, ...] = (
         "accel_bias",
         Parameter("mps2", -2.0, 2.0, 0.02, scatter_rank=2),
         WITH_IMU,
+        (ACCEL,),
         "several runs, since every power-on has a bias of its own",
         homes=(Home("sensors", "accel_bias_x_mps2", Combine.ADDED, scaled_by="accel_scale_x_ratio"),),
         inverse=Inverse(("imu",), ("accel_x_",), Combine.SUBTRACTED, without_home=True),
@@ -607,6 +619,7 @@ LIBRARY: tuple[Effect, ...] = (
         "imu_latency",
         Parameter("s", 0.0, 0.5, 0.005),
         WITH_IMU,
+        (GYRO, ACCEL),
         "steps of the yaw rate, and a camera that is not late",
         homes=(Home("sensors", "imu_latency_s", Combine.ADDED),),
         inverse=Inverse(("imu",), STAMPS, Combine.SUBTRACTED, without_home=True),
@@ -619,6 +632,7 @@ LIBRARY: tuple[Effect, ...] = (
         "camera_latency",
         Parameter("s", 0.0, 1.0, 0.005),
         EVERY,
+        (SPEED_X, SPEED_Y, HEADING),
         "accelerations at two frequencies",
         homes=(Home("camera", "latency_s", Combine.ADDED),),
         words=_late("the camera or lidar"),
@@ -630,6 +644,7 @@ LIBRARY: tuple[Effect, ...] = (
         "camera_yaw",
         Parameter("rad", -0.3, 0.3, 0.005),
         EVERY,
+        (SPEED_X, SPEED_Y),
         "straight, on more than one side slope",
         inverse=Inverse(("odometry", "lidar", "pose"), undo=_undo_camera_yaw, act=_act_camera_yaw),
         words=_sided(math.degrees(1.0), "the camera turned {number}° to the {side}", "right", "left"),
@@ -644,6 +659,7 @@ LIBRARY: tuple[Effect, ...] = (
             for name in ("lever_x", "lever_y")
         ),
         EVERY,
+        (SPEED_X, SPEED_Y),
         "turns to both sides",
         sensed_only=True,
         stage=Stage.DESCRIPTION,
@@ -656,6 +672,7 @@ LIBRARY: tuple[Effect, ...] = (
         "clock_offset",
         Parameter("s", -0.5, 0.5, 0.005),
         WITH_IMU,
+        (*MOTION, HEADING),
         "switching manoeuvres",
         inverse=Inverse(OTHER_LOGGER, STAMPS, Combine.SUBTRACTED),
         stage=Stage.SENSORS,
@@ -667,6 +684,7 @@ LIBRARY: tuple[Effect, ...] = (
         "clock_rate",
         Parameter("ratio", -0.02, 0.02, 0.0005, as_percent=True, is_error=True),
         WITH_IMU,
+        (*MOTION, HEADING),
         "switching manoeuvres from the start of a run to its end",
         inverse=Inverse(OTHER_LOGGER, STAMPS, Combine.OVER),
         stage=Stage.SENSORS,
@@ -676,6 +694,7 @@ LIBRARY: tuple[Effect, ...] = (
         "encoder_lag",
         Parameter("s", 0.0, 0.5, 0.005),
         WITH_IMU,
+        (*MOTION, CURRENT, TURNING_CURRENT, HEADING),
         "accelerations",
         homes=(Home("sensors", "encoder_time_constant_s", Combine.ADDED),),
         stage=Stage.DESCRIPTION,
@@ -687,6 +706,7 @@ LIBRARY: tuple[Effect, ...] = (
         "effective_track",
         Parameter("ratio", -0.5, 4.0, 0.02, scatter_rank=9, as_percent=True, is_error=True),
         SKIDDING,
+        (GYRO, SPEED_Y, HEADING),
         "turns in place and in arcs, and an absolute heading",
         homes=(Home("", "track_m", Combine.TIMES),),
         twins=(("gyro_scale", HEADING),),
@@ -699,6 +719,7 @@ LIBRARY: tuple[Effect, ...] = (
         "turning_slip",
         Parameter("ratio", -0.5, 0.9, 0.02),
         SKIDDING,
+        (*MOTION, HEADING),
         "arcs of several radii and turns in place",
     ),
     # n = 0.5 + e in turning_slip (Endo et al., IROS 2007, as in Yamauchi et al., (27))
@@ -707,6 +728,7 @@ LIBRARY: tuple[Effect, ...] = (
         "turning_slip_power",
         Parameter("ratio", -0.5, 0.5, 0.02),
         (TRACKED,),
+        (SPEED_X, ACCEL, CURRENT),
         "arcs of several radii with much turning slip",
         modifies="turning_slip",
     ),
@@ -720,6 +742,7 @@ LIBRARY: tuple[Effect, ...] = (
         "track_narrowing",
         Parameter("s2pm2", 0.0, 2.0, 0.02),
         SKIDDING,
+        (GYRO, SPEED_Y, HEADING),
         "fast arcs, and turns in place",
         words=_fast_turns,
     ),
@@ -731,12 +754,17 @@ LIBRARY: tuple[Effect, ...] = (
         "turn_drag",
         Parameter("s2", -0.1, 3.0, 0.005),
         SKIDDING,
+        (SPEED_X,),
         "arcs of several yaw rates",
         words=_turn_drag,
     ),
     # v = u - |u| c f (linear part of any thrust curve; Wong, Theory of Ground Vehicles)
     _contact(
-        "force_slip", Parameter("ratio", -0.3, 3.0, 0.02, scatter_rank=8), EVERY, "slopes and accelerations"
+        "force_slip",
+        Parameter("ratio", -0.3, 3.0, 0.02, scatter_rank=8),
+        EVERY,
+        (SPEED_X, SPEED_Y),
+        "slopes and accelerations",
     ),
     # f = f_max (1 - K/(s l) (1 - exp(-s l/K))), with K/l = c f_max / 2 so that c is its slip per force at
     # the start (Janosi and Hanamoto 1961, as integrated along the contact (Yamauchi et al., (17),
@@ -745,27 +773,32 @@ LIBRARY: tuple[Effect, ...] = (
         "shear_slip",
         Parameter("ratio", 0.0, 3.0, 0.02),
         WITH_IMU,
+        (SPEED_X, SPEED_Y),
         "tractions over half of f_max, of both small and large size",
     ),
     # resistance grows by b |s| W (Lyasko, Slip sinkage effect in soil-vehicle mechanics, J.
     # Terramechanics 2010: linear in slip)
-    _contact("slip_resistance", Parameter("ratio", 0.0, 5.0, 0.05), BOTH, "a range of slip"),
+    _contact(
+        "slip_resistance", Parameter("ratio", 0.0, 5.0, 0.05), BOTH, (CURRENT, SPEED_X), "a range of slip"
+    ),
     # resistance grows by c W (Wong, Theory of Ground Vehicles)
     # without currents it shows by the slip that it takes, as a smaller wheel radius does
     _contact(
         "rolling_resistance",
         Parameter("ratio", -0.05, 0.5, 0.005, scatter_rank=7),
         BOTH,
+        (CURRENT, SPEED_X),
         "several speeds, forward and backward",
     ),
     # resistance grows by c v (viscous friction of bearings and gears)
-    _contact("viscous_drag", Parameter("nspm", 0.0, 500.0, 3.0), BOTH, "three speeds"),
+    _contact("viscous_drag", Parameter("nspm", 0.0, 500.0, 3.0), BOTH, (CURRENT, SPEED_X), "three speeds"),
     # == Load and motors
     # mass m (1 + p) (Newton)
     effect(
         "payload",
         Parameter("ratio", -0.5, 1.5, 0.02, as_percent=True),
         (*BOTH, OMNI),
+        (CURRENT, SPEED_X),
         "accelerations and slopes",
         homes=(
             Home("", "mass_kg", Combine.TIMES),
@@ -781,6 +814,7 @@ LIBRARY: tuple[Effect, ...] = (
         "motor_constant",
         Parameter("ratio", -0.5, 1.0, 0.01, as_percent=True, is_error=True),
         BOTH,
+        (CURRENT, TURNING_CURRENT),
         "accelerations and slopes",
         homes=(Home("motors", "torque_constant_nmpa", Combine.OVER),),
         inverse=Inverse(("wheels",), ("current_",), Combine.OVER, without_home=True),
@@ -793,6 +827,7 @@ LIBRARY: tuple[Effect, ...] = (
         "motor_drift",
         Parameter("ratio", -0.5, 1.0, 0.01, as_percent=True),
         BOTH,
+        (CURRENT, TURNING_CURRENT),
         "long runs",
         inverse=Inverse(("wheels",), ("current_",), Combine.OVER, drifts=True),
     ),
@@ -804,6 +839,7 @@ LIBRARY: tuple[Effect, ...] = (
         "current_offset",
         Parameter("a", -4.0, 4.0, 0.05),
         BOTH,
+        (CURRENT,),
         "standstill, and driving forward and backward",
         inverse=Inverse(("wheels",), ("current_",), Combine.SUBTRACTED),
     ),
@@ -816,6 +852,7 @@ LIBRARY: tuple[Effect, ...] = (
         "turn_side_slip",
         Parameter("s", -0.5, 0.5, 0.005),
         SKIDDING,
+        (SPEED_Y,),
         "arcs of several speeds, to both sides",
         words=_sided(
             EXAMPLE_MPS * EXAMPLE_RADPS,
@@ -830,14 +867,19 @@ LIBRARY: tuple[Effect, ...] = (
         "side_slip_build_up",
         Parameter("s", 0.0, 1.0, 0.01, one_sided=True),
         SKIDDING,
+        (SPEED_Y,),
         "steps of the yaw rate while driving",
         modifies="turn_side_slip",
     ),
     # resistance to rolling and to turning grow by k q W (scrub of skidding wheels; the form in q as EKF
     # practice has it)
-    effect("scrub", Parameter("ratio", -0.2, 1.0, 0.005), SKIDDING, "turns"),
+    effect(
+        "scrub", Parameter("ratio", -0.2, 1.0, 0.005), SKIDDING, (CURRENT, TURNING_CURRENT, SPEED_X), "turns"
+    ),
     # v_y = -c ph |v| (Yamauchi et al., (2), with the sign that gravity sets)
-    _contact("side_hill_slip", Parameter("ratio", 0.0, 5.0, 0.05), WITH_IMU, "both signs of roll"),
+    _contact(
+        "side_hill_slip", Parameter("ratio", 0.0, 5.0, 0.05), WITH_IMU, (SPEED_Y,), "both signs of roll"
+    ),
     # == What makes omni robots slip, and what looks like it
     # across each wheel G = -r n W v_across / U, beside F = C n W (u - v_along) / U along it (this
     # project's; docs/measured_slip.md has how it holds on measured runs)
@@ -845,6 +887,7 @@ LIBRARY: tuple[Effect, ...] = (
         "roller_friction",
         Parameter("ratio", 0.0, 1.5, 0.01),
         (OMNI,),
+        (SPEED_X, SPEED_Y, HEADING, GYRO, CURRENT),
         "straight drives in several directions",
     ),
     # n_i = (1 + 2 c . p_i / d^2) / 3 of wheels at p_i, d from the middle, with the centre of mass c
@@ -863,6 +906,7 @@ LIBRARY: tuple[Effect, ...] = (
             for axis in ("x", "y")
         ),
         (OMNI,),
+        (SPEED_X, SPEED_Y, HEADING, GYRO),
         "straight drives in several directions over ground on which the rollers resist",
         words=_centre_of_mass,
     ),
@@ -872,6 +916,7 @@ LIBRARY: tuple[Effect, ...] = (
         "wheel_distance",
         Parameter("ratio", -0.1, 0.1, 0.005, as_percent=True, is_error=True),
         (OMNI,),
+        (HEADING, GYRO),
         "turns",
         homes=(Home("", "track_m", Combine.TIMES), Home("", "wheelbase_m", Combine.TIMES)),
         words=_wheel_distance,
@@ -882,6 +927,7 @@ LIBRARY: tuple[Effect, ...] = (
         "camera_scale",
         Parameter("ratio", -0.3, 0.3, 0.01, as_percent=True, is_error=True),
         (OMNI,),
+        (SPEED_X, SPEED_Y),
         "straight drives, and turns to part it from the radius of the wheels",
         inverse=Inverse(("pose",), ("position_",), Combine.OVER),
         sensed_only=True,
@@ -893,6 +939,7 @@ LIBRARY: tuple[Effect, ...] = (
         "steering_offset_front",
         Parameter("rad", -0.3, 0.3, 0.005),
         (BICYCLE,),
+        (GYRO, HEADING),
         "several speeds and standstill",
         inverse=Inverse(("steering",), ("angle_front_",), Combine.ADDED),
     ),
@@ -905,6 +952,7 @@ LIBRARY: tuple[Effect, ...] = (
         "understeer",
         Parameter("s2pm", -0.01, 0.1, 0.001),
         (BICYCLE,),
+        (GYRO, HEADING),
         "arcs of several speeds, to both sides",
         words=_understeer,
     ),
@@ -916,6 +964,7 @@ LIBRARY: tuple[Effect, ...] = (
         "cornering_stiffness",
         Parameter("ratio", -0.7, 2.0, 0.02, as_percent=True, is_error=True),
         (BICYCLE,),
+        (SPEED_Y, GYRO),
         "fast arcs to both sides, side slopes and steps of the steering",
         homes=(Home("", "front_cornering_npr", Combine.TIMES), Home("", "rear_cornering_npr", Combine.TIMES)),
     ),

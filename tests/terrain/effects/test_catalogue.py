@@ -67,42 +67,6 @@ GROUND = Ground(roller_ratio=0.2)
 """Rollers of omni wheels that resist: without them it does not matter where the load is."""
 
 
-RATES = "gyro heading "
-ALL = RATES + "ahead left "
-SHOWN = {
-    ALL: "one_sided_radius wheel_scale_1 wheel_scale_2 wheel_scale_3 steering_offset_1 steering_offset_2 "
-    "steering_backlash steering_delay clock_offset clock_rate turning_slip load_shift",
-    ALL + "current": "wheel_radius roller_friction",
-    ALL + "current turning_current": "encoder_lag",
-    RATES + "left": "yaw_delay effective_track track_narrowing",
-    RATES: "wheel_distance steering_offset_front understeer",
-    "gyro": "gyro_bias gyro_scale",
-    "gyro ahead left": "steering_offset_3",  # that wheel is beside the middle, and hardly turns it
-    "gyro accel": "imu_latency",
-    "gyro left": "cornering_stiffness",
-    "accel": "accel_bias",
-    "heading ahead left": "camera_latency",
-    "ahead left": "camera_yaw lever_arm force_slip shear_slip camera_scale",
-    "ahead accel current": "turning_slip_power",
-    "ahead": "turn_drag",
-    "left": "turn_side_slip side_slip_build_up side_hill_slip",
-    "ahead current": "slip_resistance rolling_resistance viscous_drag payload",
-    "current turning_current": "motor_constant motor_drift",
-    "current": "current_offset",
-    "ahead current turning_current": "scrub",
-}
-"""Effects by the channels that show them, a tenth as clearly over the noise as the clearest does."""
-
-SHORT = dict(
-    zip(["gyro", "ahead", "left", "accel", "current", "turning_current", "heading"], CHANNELS, strict=True)
-)
-CHANNELS_OF = {
-    name: {SHORT[channel] for channel in channels.split()}
-    for channels, names in SHOWN.items()
-    for name in names.split()
-}
-
-
 def rich_drive(drive):
     """Return wheel speeds, steering, grade and roll of a drive that shows every effect."""
     t = DT * np.arange(1500)
@@ -155,6 +119,7 @@ def test_names_are_unique_and_entries_are_whole():
     assert set(NUISANCES) == set(spread_numbers("scatter"))
     for effect in LIBRARY:
         assert set(effect.drives) <= set(EVERY)
+        assert set(effect.channels) <= set(CHANNELS)
         assert effect.needs
         assert (effect.stage is None) == (SWERVE not in effect.drives)
         robot = ROBOTS["swerve" if SWERVE in effect.drives else effect.drives[0]]
@@ -177,11 +142,11 @@ entry = """
         "gear_wear",
         Parameter("ratio", -0.1, 0.1, 0.001, one_sided=True, scatter_rank=10, as_percent=True, is_error=True,
                   deprecated=("worn_ratio",)),
-        (SWERVE,), "z", True, Stage.DESCRIPTION, deprecated=("worn",),
+        (SWERVE,), (CURRENT,), "z", True, Stage.DESCRIPTION, deprecated=("worn",),
         homes=(Home("motors", "efficiency_ratio", Combine.TIMES),),
     ),
     effect(
-        "ticks", Parameter("ratio", -0.1, 0.1, 0.001), (SWERVE,), "z", True, Stage.SENSORS,
+        "ticks", Parameter("ratio", -0.1, 0.1, 0.001), (SWERVE,), (SPEED_X,), "z", True, Stage.SENSORS,
         inverse=Inverse(("wheels",), undo=lambda block, e: block.values.__imul__(1.0 + e)),
         words=lambda terms: f"wheels that count {100 * terms[0].total:.0f} % too much",
     ),
@@ -262,15 +227,13 @@ def test_an_effect_shows_in_the_channels_that_it_names_and_in_no_others(response
         drives = [drive for drive in effect.drives if drive in BOTH] or effect.drives
         share = np.max([responses[d, effect.name] / responses[d, effect.name].max() for d in drives], axis=0)
         clear, noticeable = (set(np.array(CHANNELS)[share > least]) for least in (CLEAR, NOTICEABLE))
-        assert clear <= CHANNELS_OF[effect.name] <= noticeable, effect.name
+        assert clear <= set(effect.channels) <= noticeable, effect.name
 
 
 @pytest.mark.parametrize("drive", ["omni", "bicycle"])
 def test_what_acts_on_every_robot_shows_most_in_the_same_channels_of_others(responses, drive):
     for effect in library_of(drive):  # omni wheels: a resistance also turns the body, and drives it sideways
-        assert CHANNELS[int(np.argmax(responses[drive, effect.name]))] in CHANNELS_OF[effect.name], (
-            effect.name
-        )
+        assert CHANNELS[int(np.argmax(responses[drive, effect.name]))] in effect.channels, effect.name
 
 
 def test_twins_are_mutual_and_differ_in_their_distinguishing_channel(responses):
