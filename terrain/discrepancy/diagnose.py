@@ -81,15 +81,7 @@ def diagnose(
         again = list(dict.fromkeys([*fit.causes, effect_named(varying[0].name)]))
         info = problem.at(fit.info.origin).counted_from(start.vector)
         fit = _withdraw_wrong(problem, refit(problem, info, again), withdrawn)
-    for cause in fit.causes:
-        if (
-            cause.name in varies and cause in fit.causes
-        ):  # which others may have left with one withdrawn before
-            k = max(fit.at(cause), key=lambda k: abs(fit.change[k]))
-            value, scatter = abs(fit.change[k]), constancy.run_scatter(problem, fit, fit.names[k])
-            if scatter > constancy.VARIES_RATIO * value:
-                reason = f"its value differs from run to run, by {scatter:.3g} about a size of {value:.3g}"
-                fit = _withdraw(problem, fit, cause, reason, withdrawn)
+    fit = _withdraw_varying(problem, fit, varies, withdrawn)
     fit = pooled(problem, fit._replace(rivals=rivals_of(problem, fit.info, start, fit.causes)))
 
     # channels that depend on an input, the most significant of each, or on a cause that was withdrawn
@@ -204,6 +196,21 @@ def _withdraw_wrong(problem: Problem, fit: CauseFit, withdrawn: dict[str, verdic
         doubtful = [cause for cause in fit.causes if cause.name in reasons]
         worst = min(doubtful, key=lambda cause: raw_gain(fit, cause))
         fit = _withdraw(problem, fit, worst, reasons[worst.name], withdrawn)
+    return fit
+
+
+def _withdraw_varying(
+    problem: Problem, fit: CauseFit, varies: set[str], withdrawn: dict[str, verdict.RuledOut]
+) -> CauseFit:
+    """Withdraw the causes whose value differs so much from run to run that it is none."""
+    for cause in fit.causes:
+        if cause.name not in varies or cause not in fit.causes:  # it may have left with one before it
+            continue
+        k = max(fit.at(cause), key=lambda k: abs(fit.change[k]))
+        value, scatter = abs(fit.change[k]), constancy.run_scatter(problem, fit, fit.names[k])
+        if scatter > constancy.VARIES_RATIO * value:
+            reason = f"its value differs from run to run, by {scatter:.3g} about a size of {value:.3g}"
+            fit = _withdraw(problem, fit, cause, reason, withdrawn)
     return fit
 
 

@@ -8,7 +8,6 @@ import pytest
 from terrain.control.fault_drives import (
     BARS,
     FAULT_SITUATIONS,
-    LIMITS,
     FaultDrive,
     GuardedPilot,
     fault_figures,
@@ -118,11 +117,11 @@ def test_each_bar_is_met_up_to_its_limit_while_it_counts(bar, drive, clean, plai
     assert judge(found, Nature.TOLERABLE if bar == "goes_on" else Nature.LYING)[bar] is met
 
 
-def test_a_fault_counts_until_its_end_or_for_good_and_limits_decide():
+def test_a_fault_counts_until_its_end_or_for_good():
     assert figures(made(), end_s=2.2).ok_total_s == 0.2
     for_good = figures(made(), end_s=math.inf)
     assert (for_good.ok_total_s, math.isnan(for_good.recovery_s)) == (6.0, True)
-    assert judge(for_good, Nature.DEAD, LIMITS._replace(ok_s=6.0))["ok_ends"] is True
+    assert judge(for_good, Nature.DEAD)["ok_ends"] is False
 
 
 def test_situations_have_no_fault_by_chance_and_unknown_ones_are_refused():

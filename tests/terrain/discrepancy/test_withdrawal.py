@@ -163,3 +163,17 @@ def test_what_runs_deviate_by_themselves_is_not_free(hide, pose, solve):
     effects = channel_effects(fit, fit.causes[0])
     gained = sum(without - with_cause for without, with_cause, _ in effects.values())
     assert gained == pytest.approx(2 * g @ x - x @ a @ x, rel=1e-6)
+
+
+def test_a_cause_that_varies_takes_with_it_what_does_nothing_without_it(hide, pose, solve, monkeypatch):
+    """And the one that has left is not withdrawn once more, though its value differs from run to run, too."""
+    problem = pose(
+        hide({"turn_side_slip_s": 0.2, "side_slip_build_up_s": 0.5}), ("turn_side_slip", "side_slip_build_up")
+    )
+    fit, withdrawn = solve(problem), {}
+    both = {"turn_side_slip", "side_slip_build_up"}
+    assert {cause.name for cause in fit.causes} == both
+    monkeypatch.setattr(diagnose.constancy, "run_scatter", lambda *_: 9.0)
+    left = diagnose._withdraw_varying(problem, fit, both, withdrawn)
+    assert (left.causes, [*withdrawn]) == ((), ["turn_side_slip"])
+    assert "differs from run to run, by 9 about a size of 0." in withdrawn["turn_side_slip"].reason
