@@ -61,6 +61,7 @@ def test_an_export_is_imported_as_the_same_runs(raw, datasets_dir, tmp_path, tar
         assert result.topics["imu.csv"] == len(one.streams["imu"])
 
 
+@pytest.mark.slow
 def test_other_libraries_read_the_same_numbers(raw, estimated_run, tmp_path):
     run = estimated_run
     for target in TARGETS:

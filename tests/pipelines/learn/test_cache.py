@@ -112,6 +112,7 @@ def test_runs_whose_files_did_not_change_are_not_read_again(runs_dir, cached, mo
     assert [run.run_id for (run,) in read] == ["ICE_1"]
 
 
+@pytest.mark.slow
 def test_only_one_run_is_held_at_a_time(cached, monkeypatch):
     usual, alive = cache.run_print, []
 

@@ -69,6 +69,7 @@ def members_of(content):
         return {name: source.read(name) for name in source.namelist()}
 
 
+@pytest.mark.slow
 def test_damage_that_the_checksum_covers_up_ends_in_one_sentence(model_dir, put):
     """Of the archive, and of what lies in it, which its own checksums then do not cover."""
     whole = (model_dir / MODEL_FILE).read_bytes()

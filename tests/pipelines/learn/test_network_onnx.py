@@ -78,6 +78,7 @@ def test_onnx_computes_the_network(folder, fitted, windows):
 
 
 @pytest.mark.parametrize("fitted", ["cnn"], indirect=True)
+@pytest.mark.slow
 def test_numbers_of_a_network_that_a_checksum_covers_up_end_in_one_sentence(folder):
     file, info = folder / ONNX_FILE, read_model(folder).info
     whole = file.read_bytes()

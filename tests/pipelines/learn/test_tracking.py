@@ -101,6 +101,7 @@ def test_a_model_is_loaded_by_alias_version_run_and_folder_and_as_pyfunc(in_trac
     np.testing.assert_array_equal(served, probability)
 
 
+@pytest.mark.slow
 def test_the_alias_is_at_the_champion_whatever_is_registered(in_tracked, log, mlflow):
     aliases = lambda name: mlflow.MlflowClient().get_registered_model(name).aliases  # noqa: E731
     for macro_f1, digest, champion in (

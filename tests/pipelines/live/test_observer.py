@@ -80,6 +80,7 @@ def test_a_skid_steer_robot_is_filtered_where_its_model_needs_the_filter(trained
     assert observer.estimate.speed_x_mps > 0.1
 
 
+@pytest.mark.slow
 def test_slip_by_an_observer_of_tracked_robots_is_a_feature_in_the_log_and_live(trained):
     robot, sloped = load_robot("orchard_ugv"), Conditions(grade_ratio=(0.15, 0))
     runs = [

@@ -310,6 +310,7 @@ for k in range(1_000_000):
 """
 
 
+@pytest.mark.slow
 def test_a_killed_process_loses_at_most_two_seconds(tmp_path):
     process = subprocess.Popen([sys.executable, "-c", KILLED, str(tmp_path)])
     path = tmp_path / "f.mcap"

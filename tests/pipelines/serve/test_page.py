@@ -136,6 +136,7 @@ def test_a_robot_is_shown_with_terrain_target_and_model_and_markup_is_text(servi
     del service.hub.trouble["<b>"]
 
 
+@pytest.mark.slow
 def test_a_driven_robot_is_shown_with_command_and_plots_in_light_and_dark_and_on_a_phone(driving, opened):
     with robot(driving, "R" * 64, control=True):
         page = opened(driving, color_scheme="dark", viewport={"width": 1280, "height": 900})
@@ -180,6 +181,7 @@ def test_robots_come_and_go_and_are_chosen_by_the_keyboard(driving, opened):
     assert page.evaluate("document.body.classList.contains('stale')")
 
 
+@pytest.mark.slow
 def test_the_page_asks_for_a_token_says_that_the_service_has_gone_and_goes_on_when_it_is_back(
     model_folder, opened, monkeypatch
 ):

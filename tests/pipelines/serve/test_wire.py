@@ -263,6 +263,7 @@ def test_a_body_of_any_size_takes_no_memory(service, sized):
     assert resident_bytes() - before < 20e6
 
 
+@pytest.mark.slow
 def test_a_receiver_that_does_not_read_is_ended_and_disturbs_no_other(driving):
     with raw(driving, {**DRIVEN, "rate_hz": 200, "session": "slow"}, buffer=8192) as slow:
         until(lambda: "slow" in driving.hub.sessions)

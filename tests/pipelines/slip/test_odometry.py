@@ -40,6 +40,7 @@ def test_slip_that_is_known_gains_and_its_model_is_a_file(turns, tmp_path):
     assert written.turning_exponent == pytest.approx(found.value, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_commands_of_the_measured_marmotte_held_out(measured):
     result = judged(measured("drive_marmotte"), robot="marmotte", folds=5)
     assert [round(scores.length_s) for scores in result.scores] == [2, 6]

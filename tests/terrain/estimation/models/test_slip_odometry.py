@@ -189,6 +189,7 @@ def test_given_slip_is_followed_to_the_millimetre(slope):
         assert track.slip[50:, k] == pytest.approx(truth.channel(name)[::2][50:699], abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_many_models():
     rng = np.random.default_rng(1)
     std = np.array([0.02, 0.01, 0.03, 0.02, 0.04, 0.02, 0.02, *np.full(8, 0.02), 0.05])
@@ -203,6 +204,7 @@ def test_the_covariance_is_that_of_many_models():
     assert stated[2] == pytest.approx(0.0, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_the_covariance_holds_the_noise_of_gyro_and_encoders():
     rng = np.random.default_rng(2)
     settings = OdometrySettings(gyro_noise_radps=0.01, gyro_bias_std_radps=0.002, encoder_noise_mps=0.01)
