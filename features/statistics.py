@@ -14,6 +14,7 @@ import math
 import numpy as np
 from scipy import fft
 
+from terrain.kernels import njit
 from terrain.records import Array
 
 #: Name and unit of each column; ``x`` is the unit of the channel.
@@ -47,6 +48,63 @@ _FLOOR = 1e-4  # SI unit, under a logarithm: the resolution of a good sensor; a 
 _POWER_FLOOR = 1e-10  # squared SI unit per Hz, under a logarithm: the noise density of a good sensor
 
 
+@njit
+def _statistics(values: Array, in_order: Array, rate_hz: float, out: Array) -> None:
+    n_windows, n_channels, n = values.shape
+    for i in range(n_windows):
+        for c in range(n_channels):
+            x = values[i, c]
+            mean = square = absolute = 0.0
+            for k in range(n):
+                mean += x[k]
+                square += x[k] * x[k]
+                absolute += abs(x[k])
+            mean /= n
+            m2 = m3 = m4 = peak = steps = 0.0
+            crossings = 0
+            for k in range(n):
+                d = x[k] - mean
+                m2 += d * d
+                m3 += d * d * d
+                m4 += d * d * d * d
+                peak = max(peak, abs(d))
+                if k > 0:
+                    previous = x[k - 1] - mean
+                    steps += abs(d - previous)
+                    if (d >= 0.0) != (previous >= 0.0):
+                        crossings += 1
+            m2 /= n
+            std = math.sqrt(m2)
+            flat = std <= _FLAT
+            ordered = in_order[i, c]
+            row = out[i, c]
+            row[0] = mean
+            row[1] = std
+            row[2] = math.log10(std + _FLOOR)
+            row[3] = 0.0 if flat else m3 / n / (m2 * std)
+            row[4] = 0.0 if flat else m4 / n / (m2 * m2) - 3.0
+            row[5] = ordered[0]
+            row[6] = ordered[n - 1]
+            for j in range(len(_QUANTILES)):
+                position = _QUANTILES[j] * (n - 1)
+                low = int(position)
+                high = min(low + 1, n - 1)
+                row[7 + j] = ordered[low] + (position - low) * (ordered[high] - ordered[low])
+            row[12] = row[10] - row[8]
+            row[13] = math.sqrt(square / n)
+            row[14] = absolute / n
+            row[15] = 0.0 if flat else peak / std
+            row[16] = crossings * rate_hz / n
+            row[17] = steps / (n - 1)
+            row[18] = 0.0 if flat else math.log10((row[17] + _FLOOR) / std)
+            for j in range(len(_LAGS)):
+                lag = _LAGS[j]
+                total = 0.0
+                for k in range(n - lag):
+                    total += (x[k] - mean) * (x[k + lag] - mean)
+                row[19 + j] = 0.0 if flat or lag >= n else total / n / m2
+
+
 def channel_statistics(values: Array, rate_hz: float) -> Array:
     """Return the :data:`STATISTICS` (n_windows, n_channels, 23) of finite values (n_windows, n_channels, n_samples).
 
@@ -59,47 +117,45 @@ def channel_statistics(values: Array, rate_hz: float) -> Array:
     >>> row[names.index("rms")], row[names.index("zero_crossings")]
     (np.float64(1.0), np.float64(7.5))
     """
-    x = np.ascontiguousarray(values, dtype=np.float64)
-    n = x.shape[2]
-    mean, ordered = x.mean(axis=2), np.sort(x, axis=2)
-    d = x - mean[:, :, None]
-    square = d * d
-    m2, m3, m4 = (each.mean(axis=2) for each in (square, square * d, square * square))
-    std = np.sqrt(m2)
-    flat = std <= _FLAT
-    unit = np.where(flat, 1.0, std)  # of what has no shape
-    position = np.array(_QUANTILES) * (n - 1)
-    low = position.astype(int)
-    below, above = ordered[:, :, low], ordered[:, :, np.minimum(low + 1, n - 1)]
-    quantiles = np.moveaxis(below + (position - low) * (above - below), 2, 0)
-    step = np.abs(np.diff(x, axis=2)).mean(axis=2)
-    lags = [(d[:, :, lag:] * d[:, :, :-lag]).sum(axis=2) / n if lag < n else 0.0 * mean for lag in _LAGS]
-    shapes = [
-        m3 / (unit * unit * unit),
-        m4 / (unit * unit) ** 2 - 3.0,
-        np.abs(d).max(axis=2) / unit,
-        np.log10((step + _FLOOR) / unit),
-        *(lag / (unit * unit) for lag in lags),
-    ]
-    skewness, kurtosis, crest, step_ratio, *correlations = (np.where(flat, 0.0, each) for each in shapes)
-    crossings = np.diff(d >= 0.0, axis=2).sum(axis=2) * rate_hz / n
-    columns = (
-        *(mean, std, np.log10(std + _FLOOR), skewness, kurtosis, ordered[:, :, 0], ordered[:, :, -1]),
-        *(*quantiles, quantiles[3] - quantiles[1], np.sqrt((x * x).mean(axis=2)), np.abs(x).mean(axis=2)),
-        *(crest, crossings, step, step_ratio, *correlations),
-    )
-    return np.stack(columns, axis=2)
+    out = np.empty((*values.shape[:2], len(STATISTICS)))
+    values = np.ascontiguousarray(values, dtype=np.float64)
+    _statistics(values, np.sort(values, axis=2), float(rate_hz), out)  # numpy sorts faster than numba does
+    return out
+
+
+@njit
+def _correlations(values: Array, out: Array) -> None:
+    n_windows, n_channels, n = values.shape
+    centred = np.empty((n_channels, n))
+    norm = np.empty(n_channels)
+    for i in range(n_windows):
+        for c in range(n_channels):
+            mean = 0.0
+            for k in range(n):
+                mean += values[i, c, k]
+            mean /= n
+            norm[c] = 0.0
+            for k in range(n):
+                centred[c, k] = values[i, c, k] - mean
+                norm[c] += centred[c, k] * centred[c, k]
+            norm[c] = math.sqrt(norm[c])
+        j = 0
+        for a in range(n_channels):
+            for b in range(a + 1, n_channels):
+                total = 0.0
+                for k in range(n):
+                    total += centred[a, k] * centred[b, k]
+                scale = norm[a] * norm[b]
+                out[i, j] = total / scale if scale > _FLAT * _FLAT else 0.0
+                j += 1
 
 
 def channel_correlations(values: Array) -> Array:
     """Return the correlation of each pair of channels (0, 1), (0, 2), ... (n_windows, pairs); 0 where one is flat."""
-    d = np.ascontiguousarray(values, dtype=np.float64)
-    d = d - d.mean(axis=2, keepdims=True)
-    norm = np.sqrt((d * d).sum(axis=2))
-    a, b = np.triu_indices(values.shape[1], 1)
-    scale = norm[:, a] * norm[:, b]
-    varies = scale > _FLAT**2
-    return np.where(varies, (d @ d.swapaxes(1, 2))[:, a, b] / np.where(varies, scale, 1.0), 0.0)
+    n_channels = values.shape[1]
+    out = np.empty((values.shape[0], n_channels * (n_channels - 1) // 2))
+    _correlations(np.ascontiguousarray(values, dtype=np.float64), out)
+    return out
 
 
 def n_bands(n_samples: int) -> int:
@@ -139,30 +195,62 @@ def channel_spectra(values: Array, rate_hz: float) -> Array:
     power = (lines.real**2 + lines.imag**2) * (2.0 / (rate_hz * np.sum(taper**2)))
     if n % 2 == 0:
         power[:, :, -1] /= 2  # Nyquist is its own mirror image
-    edges = np.linspace(0, power.shape[2], n_bands(n) + 1).round().astype(np.int64)
-    bands, total = np.add.reduceat(power, edges[:-1], axis=2), power.sum(axis=2)
-    silent, n_lines, resolution_hz = total <= _POWER_FLOOR, power.shape[2], rate_hz / n
-    weight, line = power / np.where(silent, 1.0, total)[:, :, None], np.arange(1, n_lines + 1)
-    centroid, log_power = (weight * line).sum(axis=2), np.log(power + _POWER_FLOOR)
-    away = line - centroid[:, :, None]
-    square = weight * away * away
-    m2, m3, m4 = (each.sum(axis=2) for each in (square, square * away, square * away * away))
-    width = np.maximum(np.sqrt(m2), 1.0)  # not under the resolution
-    reached = np.cumsum(power, axis=2) >= ROLLOFF * total[:, :, None]
-    moments = (
-        centroid * resolution_hz,
-        np.sqrt(m2) * resolution_hz,
-        m3 / width**3,
-        m4 / width**4,
-        (np.log(total + _POWER_FLOOR) - (weight * log_power).sum(axis=2)) / math.log(n_lines),
-        np.exp(log_power.mean(axis=2)) / (total / n_lines + _POWER_FLOOR),
-        np.where(reached.any(axis=2), reached.argmax(axis=2) + 1, n_lines) * resolution_hz,
-        (power.argmax(axis=2) + 1) * resolution_hz,
-        weight.max(axis=2),
-    )
-    powers = np.concatenate([bands / np.diff(edges), total[:, :, None] * resolution_hz], axis=2)
-    shape = np.where(silent[:, :, None], 0.0, np.stack(moments, axis=2))
-    return np.concatenate([np.log10(powers + _POWER_FLOOR), shape], axis=2)
+    bands = n_bands(n)
+    edges = np.linspace(0, power.shape[2], bands + 1).round().astype(np.int64)
+    out = np.empty((*values.shape[:2], bands + len(MOMENTS)))
+    _describe(power, np.log(power + _POWER_FLOOR), edges, rate_hz / n, out)
+    out[:, :, : bands + 1] = np.log10(out[:, :, : bands + 1] + _POWER_FLOOR)
+    return out
+
+
+@njit
+def _describe(power: Array, log_power: Array, edges: Array, resolution_hz: float, out: Array) -> None:
+    """Fill in mean band powers, total power (both not yet under a logarithm) and the other moments."""
+    n_windows, n_channels, n_lines = power.shape
+    bands = edges.size - 1
+    for i in range(n_windows):
+        for c in range(n_channels):
+            p, log_p, row = power[i, c], log_power[i, c], out[i, c]
+            total = 0.0
+            for b in range(bands):
+                band = 0.0
+                for k in range(edges[b], edges[b + 1]):
+                    band += p[k]
+                row[b] = band / (edges[b + 1] - edges[b])
+                total += band
+            row[bands] = total * resolution_hz
+            if total <= _POWER_FLOOR:
+                row[bands + 1 :] = 0.0
+                continue
+            centroid = log_mean = log_weighted = 0.0
+            peak = 0
+            for k in range(n_lines):
+                centroid += p[k] / total * (k + 1)
+                log_mean += log_p[k]
+                log_weighted += p[k] / total * log_p[k]
+                if p[k] > p[peak]:
+                    peak = k
+            m2 = m3 = m4 = sum_so_far = 0.0
+            rolloff = n_lines
+            for k in range(n_lines):
+                d = k + 1 - centroid
+                weight = p[k] / total
+                m2 += weight * d * d
+                m3 += weight * d * d * d
+                m4 += weight * d * d * d * d
+                sum_so_far += p[k]
+                if rolloff == n_lines and sum_so_far >= ROLLOFF * total:
+                    rolloff = k + 1
+            width = max(math.sqrt(m2), 1.0)  # not under the resolution
+            row[bands + 1] = centroid * resolution_hz
+            row[bands + 2] = math.sqrt(m2) * resolution_hz
+            row[bands + 3] = m3 / width**3
+            row[bands + 4] = m4 / width**4
+            row[bands + 5] = (math.log(total + _POWER_FLOOR) - log_weighted) / math.log(n_lines)
+            row[bands + 6] = math.exp(log_mean / n_lines) / (total / n_lines + _POWER_FLOOR)
+            row[bands + 7] = rolloff * resolution_hz
+            row[bands + 8] = (peak + 1) * resolution_hz
+            row[bands + 9] = p[peak] / total
 
 
 def slip_statistics(slip_ratio: Array) -> Array:
