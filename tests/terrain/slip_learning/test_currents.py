@@ -51,6 +51,10 @@ def test_a_current_that_is_off_moves_the_slip_that_goes_with_it(fitted):
     without = fitted.predict_slip(alone)
     assert np.std(with_currents.slip_ratio - slip) < 0.5 * np.std(without.slip_ratio - slip)
     assert (without.high - without.low > with_currents.high - with_currents.low).mean() > 0.95
+    # the deviation holds how far the grounds' means are apart, where nothing tells the ground
+    for found in (with_currents, without):
+        error = np.sqrt(np.mean((found.slip_ratio - slip) ** 2))
+        assert np.sqrt(np.mean(found.slip_std**2)) == pytest.approx(error, rel=0.25)
 
 
 def test_a_standing_robot_has_no_slip_and_nothing_to_learn_from_is_refused(fitted):
