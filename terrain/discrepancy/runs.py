@@ -36,6 +36,7 @@ from terrain.effects import (
     vector_of,
 )
 from terrain.errors import ConfigError, DataError
+from terrain.kernels import njit
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
 from terrain.logs.schema import POSE_CHANNELS
@@ -540,6 +541,7 @@ def prepare_inputs(signals: Signals, low_pass: LowPass) -> tuple[float, Array, A
     return signals.dt_s * max(low_pass.inputs_every, 1), wheel_speed, steer, grade[:, 0], roll[:, 0], measured
 
 
+@njit
 def decimate(values: Array, known: Array, taps: Array, every: int) -> Array:
     """Return columns (m, c) of ``values`` (n, c) filtered by a window and decimated; a NaN spreads.
 
@@ -547,17 +549,24 @@ def decimate(values: Array, known: Array, taps: Array, every: int) -> Array:
     be left out of whatever is compared.  Where less than :data:`MIN_KNOWN` of the window's weight is known, it is the
     mean over all: NaN, if there is one among them.
     """
-    if len(values) < taps.size:
-        return np.empty((0, values.shape[1]))
-
-    def behind(columns: Array, weights: Array) -> Array:
-        return np.asarray(np.lib.stride_tricks.sliding_window_view(columns, taps.size, 0)[::every] @ weights)
-
-    out = behind(values, taps)
-    if known.size:
-        there, size = known.astype(float), np.abs(taps)
-        total, weight = behind(np.where(known, values, 0.0), taps), behind(there, taps)
-        np.divide(total, weight, out=out, where=behind(there, size) >= MIN_KNOWN * size.sum())
+    n, c = values.shape
+    m = max((n - taps.size) // every + 1, 0)
+    out = np.zeros((m, c))
+    whole = np.abs(taps).sum()
+    for row in range(m):
+        start = row * every
+        for t in range(taps.size):
+            for j in range(c):
+                out[row, j] += taps[t] * values[start + t, j]
+        for j in range(known.shape[1]):
+            total, weight, there = 0.0, 0.0, 0.0
+            for t in range(taps.size):
+                if known[start + t, j]:
+                    total += taps[t] * values[start + t, j]
+                    weight += taps[t]
+                    there += abs(taps[t])
+            if there >= MIN_KNOWN * whole:
+                out[row, j] = total / weight
     return out
 
 
