@@ -72,9 +72,8 @@ def class_probabilities(margins: Array, n_classes: int, scale: float) -> Array:
     known: Array = ratio.max(axis=2) > 0.0
     system = np.where(known[:, :, None] & known[:, None], 1.0 - ratio * ratio.swapaxes(1, 2), 0.0)
     both = np.arange(n_classes)
-    system[:, both, both] = 1.0 + np.square(ratio).sum(
-        axis=1
-    )  # alone, a class that is not known has the solution 0
+    # a class that is not known stands alone, and has the solution 0
+    system[:, both, both] = 1.0 + np.square(ratio).sum(axis=1)
     solution = np.linalg.solve(system, known[:, :, None].astype(float))[:, :, 0]
     solution = np.maximum(solution, 0.0)  # -1e-17 of rounding
     return np.asarray(solution / solution.sum(axis=1, keepdims=True))

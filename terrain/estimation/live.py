@@ -24,7 +24,6 @@ import math
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -109,8 +108,6 @@ class Live(ABC):
     filter: Filter | None
     name: str  #: of the filter or observer
     states: tuple[str, ...]  #: name of each state, in the order of ``mean`` and ``std``
-    #: of each sensor at the last tick; empty where none is judged
-    health: Mapping[str, str] = MappingProxyType({})
     latest: Any
     _ticks_without_wheels = False  #: whether time goes on where the wheels give nothing
 
@@ -156,6 +153,11 @@ class Live(ABC):
     @abstractmethod
     def _restore(self, memory: Any) -> None:
         """Go back to a snapshot."""
+
+    @property
+    def health(self) -> dict[str, str]:
+        """Health of each sensor at the last tick, by name; empty where none is judged."""
+        return {}
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -429,7 +431,7 @@ class LiveFilter(Live):
         return {kind: n for kind, n in counts.items() if n}
 
     @property
-    def health(self) -> dict[str, str]:  # type: ignore[override]
+    def health(self) -> dict[str, str]:
         """Health of each sensor at the last tick, by name; empty where none is judged."""
         return {} if self._monitor is None else self._monitor.names
 

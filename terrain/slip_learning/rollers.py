@@ -161,6 +161,10 @@ def roller_findings(
     for train, test in folds(fold[fitted]):
         part = identify(partial(misfit, fitted[train]), parameters).value
         left[fitted[test]] = misfit(fitted[test], part)[:, 0]
+
+    def as_on(rows: Array, surface: str, two: Array) -> Array:
+        return misfit(rows, np.concatenate([two, fit.value[2:]]), surface)
+
     loads, load_interval = fit.derived(loads_of)
     ratios, ratio_interval = fit.derived(lambda values: np.exp(values[3:]))
     other_surface: dict[str, str] = {}
@@ -171,11 +175,7 @@ def roller_findings(
             continue
         before = {surface: _rms(misfit(rows, fit.value, surface)) for surface in names}
         other_surface[name] = surface = min(before, key=before.__getitem__)
-        own = identify(
-            lambda two: misfit(rows, np.concatenate([two, fit.value[2:]]), surface),  # noqa: B023
-            ROBOT[:2],
-            starts=[fit.value[:2]],
-        )
+        own = identify(partial(as_on, rows, surface), ROBOT[:2], starts=[fit.value[:2]])
         other_loads[name] = tuple(loads_of(own.value).tolist())
         other_rms[name] = before[surface], _rms(own.residual)
     low, high = fit.interval[:, 2].tolist()

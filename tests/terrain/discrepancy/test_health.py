@@ -293,14 +293,17 @@ def test_a_reading_mends_no_channel_that_a_run_does_not_show():
     """Straight ahead a gyro says nothing; with a wheel turned the simulation turns, and its noise may fit."""
     change = Change(SIGN, Column.WHEELS, -1.0, 2)
 
-    def following(gyro, likelihood):
+    def following(gyro, likelihood, speed=0.9):
         correlation = np.zeros((1, len(CHANNELS)))
-        correlation[0, [G, X]] = gyro, 0.9
+        correlation[0, [G, X]] = gyro, speed
         return Agreement(correlation, np.array([[likelihood]]), correlation)
 
     after = following(0.98, 100.0)
     unasked, asked = (reading_of(change, following(gyro, 0.0), after) for gyro in (0.0, 0.1))
     assert (unasked.mends.tolist(), asked.mends.tolist()) == ([False], [True])
+    # nor does it suit a run whose speed fits worse by it
+    worse = reading_of(change, following(0.1, 0.0), following(0.98, 100.0, speed=0.7))
+    assert (asked.suits.tolist(), worse.suits.tolist(), worse.mends.tolist()) == ([True], [False], [False])
 
 
 @pytest.mark.parametrize("folder", ["drive_husky", "borealtc", "vulpi"])

@@ -83,7 +83,10 @@ def test_a_set_of_causes_is_not_reached_twice(three, monkeypatch):
     monkeypatch.setattr(search_module, "_weakest", weakest)
     none = WaldTest(np.zeros(1), 0.0, 1.0, np.zeros(6), True)
     monkeypatch.setattr(search_module, "wald_test", lambda *_: none)
-    in_turn = lambda info, names, left: [e for e in (first, second, third) if e in left][:1]  # noqa: E731
+
+    def in_turn(info, names, left):
+        return [effect for effect in (first, second, third) if effect in left][:1]
+
     monkeypatch.setattr(search_module, "_pair", in_turn)
     monkeypatch.setattr(search_module, "_swap_for_better", lambda _, info, causes: (causes, info))
     assert [cause.name for cause in search(problem, fit.info).causes] == ["payload", "camera_yaw"]

@@ -68,6 +68,16 @@ def test_clocks_that_are_all_set_together_cost_two_readings_and_time_goes_on(ste
     assert robot.clocks.counts["time: clock set"] == 1
 
 
+def test_clocks_that_are_set_by_little_again_and_again_are_found_again():
+    """Each time by less than a stream's own stamps tell: that the steps' clock was set says it."""
+    robot = Robot()
+    for k in range(4):
+        robot.run(10)
+        robot.step_s = dict.fromkeys(robot.step_s, -0.15 * (k + 1))
+    assert [len(ages) for _, ages in robot.run(10)][N_AGREED:] == [2] * (10 - N_AGREED)
+    assert robot.clocks.counts["wheels: too late"] == 0
+
+
 @pytest.mark.parametrize("step_s", STEPS_S)
 def test_the_clock_of_the_steps_alone_costs_no_reading(step_s):
     """The time goes on as it did: the streams' stamps still agree with it."""

@@ -5,6 +5,7 @@ import pytest
 from studies.intervals import drawn_runs
 
 from terrain.robots import load_robot
+from terrain.slip_learning import curve
 from terrain.slip_learning.curve import (
     BRAKING_CAP_SLIP,
     MIN_ABOVE_BALANCE_SLIP,
@@ -54,6 +55,19 @@ def test_true_law_is_chosen_and_its_parameters_are_recovered(law, theta):
     np.testing.assert_allclose(
         traction_ratio(law, found, slips), traction_ratio(law, theta, slips), rtol=0.12
     )
+
+
+def test_a_law_is_scored_on_runs_that_it_was_not_fitted_to():
+    """One run of the few is of softer ground: fitted to it, a law would expect it."""
+    rng = np.random.default_rng(3)
+    runs = [*drawn_runs("janosi", (0.6, 0.6), rng)[:1], *drawn_runs(*SAND, rng)[:3]]
+    score = select_law(runs)[2]["janosi"][0]
+    odd, others = curve._Pooled(runs[:1]), fit_curve("janosi", runs[1:])
+    expected = odd.log_likelihood(*odd.curve("janosi", others), odd.variance("janosi", others))
+    assert score == pytest.approx(expected, abs=0.1)
+    of_all = fit_curve("janosi", runs)
+    fitted = odd.log_likelihood(*odd.curve("janosi", of_all), odd.variance("janosi", of_all))
+    assert score < fitted - 0.5
 
 
 def test_slip_errors_do_not_bias_a_steep_law():

@@ -193,7 +193,12 @@ CURRENT_STANDING = standing("wheels", "current_{}_a")
 GYRO_LATE = late("yaw_rate_radps", gyro, lambda robot: 0.0)
 IMU_LATE = late("yaw_rate_radps", gyro, lambda robot: robot.sensors.imu_latency_s)
 CAMERA_LATE = late("speed_x_mps", lambda *run: seen(*run)[:2], lambda robot: robot.camera.latency_s)
-IMU_LENGTH = lambda run, robot: run.streams["imu"].duration_s  # noqa: E731
+
+
+def imu_length(run, robot):
+    return run.streams["imu"].duration_s
+
+
 CASES = {
     # effect: values, scenario, soil, slope, feature, its change by the values, whether it can be corrected
     "wheel_radius": ((E,), "starts", "tiles", LEVEL, rolling, E, True),
@@ -222,7 +227,7 @@ CASES = {
     "camera_yaw": ((0.05,), "straight", "tiles", LEVEL, sideways, 0.05, True),
     "lever_arm": ((0.1, -0.07), "spot_turn", "tiles", LEVEL, lever, 0.1, True),
     "clock_offset": ((0.05,), "complex", "grass", LEVEL, GYRO_LATE, 0.05, True),
-    "clock_rate": ((0.002,), "complex", "grass", LEVEL, IMU_LENGTH, 0.002 * 39.99, True),
+    "clock_rate": ((0.002,), "complex", "grass", LEVEL, imu_length, 0.002 * 39.99, True),
     "encoder_lag": ((0.04,), "starts", "grass", LEVEL, encoder_late, 0.04, True),
     "force_slip": ((0.4,), "straight", "grass", UPHILL, slips, None, False),
     "shear_slip": ((0.4,), "straight", "tiles", STEEP, slips, None, False),
