@@ -9,8 +9,9 @@ traction, ``W = m g`` the nominal weight, ``f = F / W``, ``th`` the grade (uphil
 (left side up positive), ``B`` the track, ``dv`` right minus left wheel speed and
 ``q = |dv| / (|dv| + 2 |u|)`` how tight a turn is.
 
-To add an effect, write its entry into the library, with formula, source and how it is taken off samples above it,
-and its formula into the kernels of :mod:`terrain.simulation.plants.planar`.  Everything else reads the entry.
+To add an effect, write its entry into ``data/effects/library.yaml``, with formula, source and how it is taken off
+samples above it, and its formula into the kernels of :mod:`terrain.simulation.plants.planar`.  Everything else reads
+the entry, whose keys are the fields of :class:`Effect`, :class:`Parameter`, :class:`Home` and :class:`Inverse`.
 
 The section ``effects`` of a robot's description has those found by ``terrain explain``.  Each parameter is a
 number with unit, source and interval like any other; the covariance has a row a parameter, and may be left
@@ -34,13 +35,16 @@ import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from enum import Enum
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 
 from terrain.angles import unwrapped, wrapped
 from terrain.errors import ConfigError
 from terrain.files.documents import check_keys, number
+from terrain.files.names import data_folder
 from terrain.kernels import record
 from terrain.records import Array, read_only
 
@@ -53,12 +57,9 @@ CHANNELS: tuple[str, ...] = (
 
 GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT, TURNING_CURRENT, HEADING = CHANNELS
 
-MOTION: tuple[str, ...] = (GYRO, SPEED_X, SPEED_Y)  #: Channels of the planar motion.
 SKID, TRACKED, SWERVE, OMNI, BICYCLE = "skid_steer", "tracked", "swerve", "omni", "bicycle"
 SKIDDING = (SKID, TRACKED)  #: Drives that turn by a difference of their sides.
 BOTH = (*SKIDDING, SWERVE)  #: Drives of wheels that do not roll across, but for cars.
-WITH_IMU = (*BOTH, BICYCLE)  #: Drives whose logs have an IMU.
-EVERY = (*WITH_IMU, OMNI)
 
 
 class Combine(Enum):
@@ -200,39 +201,23 @@ class Effect(NamedTuple):
     drives: tuple[str, ...]  #: kinds of robots that it applies to
     channels: tuple[str, ...]  #: where it is visible: a tenth as clearly over the noise as in the clearest
     needs: str  #: the driving that excites it
+    source: str  #: of its formula
     sensed_only: bool = False  #: it changes what sensors measure, and not the motion of the body
     stage: Stage | None = None  #: where it acts in the dynamic simulation, of the robots that that simulates
     aliases: tuple[str, ...] = ()  #: other names of the same effect, which no log distinguishes from it
+    #: effects that look the same, and the channel that distinguishes them
     twins: tuple[tuple[str, str], ...] = ()
-    """Effects that look the same, and the channel that distinguishes them."""
     deprecated: tuple[str, ...] = ()  #: former names, accepted on the command line
+    #: what its values make of the robot, as the object of "with"; by default the number of its home, or the values
     words: Callable[[Sequence[Term]], str] | None = None
-    """What its values make of the robot, as the object of "with"; by default the number of its home, or the values."""
     modifies: str = ""  #: name of the effect without which it does nothing
+    #: drive, and name of the effect that has to be known before runs of it can show this one
     beside: tuple[tuple[str, str], ...] = ()
-    """Drive, and name of the effect that has to be known before runs of it can show this one."""
-
-
-def effect(
-    name: str,
-    parameter: Parameter,
-    *entry: Any,
-    homes: tuple[Home, ...] = (),
-    inverse: Inverse | None = None,
-    **others: Any,
-) -> Effect:
-    """Return an effect of one parameter, given by its unit alone: its name is that of the effect, and the unit.
-
-    ``entry`` and ``others`` are the fields of :class:`Effect` from the drives on.
-    """
-    named = parameter._replace(name=f"{name}_{parameter.name}", homes=homes, inverse=inverse)
-    return Effect(name, (named,), *entry, **others)
 
 
 # -- Words: what a value makes of the robot -------------------------------------------------------------------
 
-#: The turn and the speed at which losses that grow with them are stated.
-EXAMPLE_RADPS, EXAMPLE_MPS = 0.5, 1.0
+EXAMPLE_RADPS = 0.5  #: The turn at which losses that grow with it are stated.
 FAST_RADPS, FAST_MPS = 1.0, 2.0  #: The same of what fast turns do.
 #: Yaw rate from which the wheels mostly slide sideways, and below which they mostly deflect; of a Warthog on asphalt
 #: and gravel.
@@ -252,29 +237,19 @@ def rounded(value: float, half: float) -> str:
     return f"{value:.{min(max(-math.floor(math.log10(half)), 0), 5)}f}"
 
 
-def _sided(scale: float, text: str, above: str, below: str) -> Callable[[Sequence[Term]], str]:
+def _sided(scale: float, text: str, above: str, below: str, terms: Sequence[Term]) -> str:
     """Return words on the size of a value, and whether it is above or below zero."""
-
-    def words(terms: Sequence[Term]) -> str:
-        (term,) = terms
-        side, wheels = above if term.total > 0 else below, "wheels"
-        if term.robot.drive == TRACKED:
-            wheels = "sprockets"
-        number = rounded(scale * abs(term.total), scale * term.half)
-        return text.format(number=number, side=side, wheels=wheels)
-
-    return words
+    (term,) = terms
+    number = rounded(scale * abs(term.total), scale * term.half)
+    wheels = "sprockets" if term.robot.drive == TRACKED else "wheels"
+    return text.format(number=number, side=above if term.total > 0 else below, wheels=wheels)
 
 
-def _late(above: str, below: str = "") -> Callable[[Sequence[Term]], str]:
-    """Return words on who is late, by a positive and by a negative value."""
-
-    def words(terms: Sequence[Term]) -> str:
-        (term,) = terms
-        who = above if term.extended > 0 else below or above
-        return f"{who} {rounded(abs(term.extended), term.half)} s late"
-
-    return words
+def _late(above: str, *more: Any) -> str:
+    """Return words on who is late, by a positive and, where another is named, by a negative value."""
+    *below, (term,) = more
+    who = above if term.extended > 0 or not below else below[0]
+    return f"{who} {rounded(abs(term.extended), term.half)} s late"
 
 
 def _track(terms: Sequence[Term]) -> str:
@@ -459,516 +434,66 @@ def _undo_camera_yaw(block: Block, angle_rad: float) -> None:
         block.values[:, block.channels.index("yaw_rad")] += angle_rad
 
 
-# -- The catalogue --------------------------------------------------------------------------------------------
+# -- The library ----------------------------------------------------------------------------------------------
 
-_contact = partial(effect, stage=Stage.CONTACT)
-_sensor = partial(effect, sensed_only=True, stage=Stage.SENSORS)
-_described_sensor = partial(effect, sensed_only=True, stage=Stage.DESCRIPTION)
-
-
-def _steering_offset(wheel: int) -> Effect:
-    name = f"steering_offset_{wheel}"
-    # d_N = measured angle + d0 (kinematics of a planar robot)
-    # wheel 3 is beside the middle, and hardly turns the robot
-    return effect(
-        name,
-        Parameter("rad", -0.3, 0.3, 0.005),
-        (SWERVE,),
-        (*MOTION, HEADING) if wheel < 3 else MOTION,
-        "several speeds and standstill",
-        homes=(Home("steering", f"zero_{wheel}_rad", Combine.SUBTRACTED),),
-        stage=Stage.LINKAGE,
+WORDS: dict[str, Callable[..., str]] = {
+    function.__name__.removeprefix("_"): function
+    for function in (
+        *(_sided, _late, _track, _wheel_distance, _lever_arm),
+        *(_centre_of_mass, _turn_drag, _fast_turns, _understeer),
     )
-
-
-def _wheel_scale(wheel: int) -> Effect:
-    """Return the scale of one encoder.
-
-    All three together span wheel_radius and one_sided_radius, so that of the five three logs
-    determine three; one alone looks like neither.
-    """
-    name = f"wheel_scale_{wheel}"
-    # wheel speed N = (1 + e) x measured (kinematics of a planar robot)
-    # an encoder that loses counts, or a tyre of another wear: a fifth is more than either
-    # Taken off: rate and speed of wheel N x (1 + e)
-    return effect(
-        name,
-        Parameter("ratio", -0.2, 0.2, 0.01, as_percent=True, is_error=True),
-        (SWERVE,),
-        (*MOTION, HEADING),
-        "straight drives in several directions",
-        inverse=Inverse(("wheels",), (f"motor_{wheel}_", f"speed_{wheel}_"), Combine.TIMES),
-        stage=Stage.SENSORS,
+}
+UNDO: dict[str, Callable[[Block, float], None]] = {
+    function.__name__.removeprefix("_undo_"): function
+    for function in (
+        *(_undo_one_sided_radius, _undo_yaw_delay, _undo_gyro),
+        *(_undo_steering_backlash, _undo_camera_yaw),
     )
+}
+ACT: dict[str, Callable[[Block, float], None]] = {"camera_yaw": _act_camera_yaw}
 
 
-#: Streams that are not stamped by the logger of the wheels.
-OTHER_LOGGER = ("imu", "odometry", "gnss", "lidar")
+def _read_library(path: Path) -> tuple[Effect, ...]:
+    """Return the effects that a file lists; whatever names no field raises TypeError."""
+    # our own data, ten times as fast as the bounded reader of what strangers write
+    entries = yaml.load(path.read_text("utf-8"), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    library = []
+    for name, entry in entries.items():
+        parameters = []
+        for parameter, numbers in entry["parameters"].items():
+            homes = []
+            for place, change in numbers.get("homes", {}).items():
+                section, _, field = place.rpartition(".")
+                about = change if isinstance(change, dict) else {"combine": change}
+                homes.append(Home(section, field, **about | {"combine": Combine(about["combine"])}))
+            inverse = numbers.get("inverse")
+            if inverse is not None:
+                functions = {"undo": UNDO.get(inverse.get("undo")), "act": ACT.get(inverse.get("act"))}
+                combine = Combine(inverse.get("combine", Combine.ADDED))
+                inverse = Inverse(**_fixed(inverse) | functions | {"combine": combine})
+            about = _fixed(numbers) | {"homes": tuple(homes), "inverse": inverse}
+            parameters.append(Parameter(parameter, **about))
+        about = _fixed(entry) | {"parameters": tuple(parameters)}
+        if "stage" in entry:
+            about["stage"] = Stage[entry["stage"].upper()]
+        if "words" in entry:
+            words, *more = entry["words"]
+            about["words"] = partial(WORDS[words], *more)
+        library.append(Effect(name, **about))
+    return tuple(library)
 
-#: Every known effect.  The order is no ranking, but results list effects in it.
-LIBRARY: tuple[Effect, ...] = (
-    # == Wheels and steering
-    # wheel speed = (1 + e) r x wheel rate, torque = (1 + e) r F (kinematics of a planar robot)
-    # Taken off: wheel speed in m/s x (1 + e), where a log has it
-    effect(
-        "wheel_radius",
-        Parameter("ratio", -0.3, 0.3, 0.01, scatter_rank=5, as_percent=True, is_error=True),
-        EVERY,
-        (*MOTION, CURRENT, HEADING),
-        "any speed; slopes and accelerations to part it from slip",
-        homes=(Home("", "wheel_radius_m", Combine.TIMES),),
-        inverse=Inverse(("wheels",), ("speed_",), Combine.TIMES),
-        stage=Stage.BODY,
-        aliases=("encoder_scale",),
-    ),
-    # wheel speeds of the right side x (1 + e/2), of the left x (1 - e/2) (kinematics of a planar robot)
-    # pressure and wear of tyres differ by a few percent from side to side
-    # Taken off: rates and speeds of the right side x (1 + e/2), left x (1 - e/2)
-    effect(
-        "one_sided_radius",
-        Parameter("ratio", -0.1, 0.1, 0.008, scatter_rank=6, as_percent=True, is_error=True),
-        BOTH,
-        (*MOTION, HEADING),
-        "fast and straight",
-        inverse=Inverse(("wheels", "truth"), undo=_undo_one_sided_radius),
-        stage=Stage.BODY,
-        words=_sided(
-            100.0, "{wheels} that are {number} % {side} on the right than on the left", "larger", "smaller"
-        ),
-    ),
-    *(_wheel_scale(wheel) for wheel in (1, 2, 3)),
-    *(_steering_offset(wheel) for wheel in (1, 2, 3)),
-    # d follows the measured angle through a play of half width b (play operator; Krasnosel'skii and
-    # Pokrovskii, Systems with Hysteresis, 1989)
-    # Taken off: angles pass through a play of half width b
-    effect(
-        "steering_backlash",
-        Parameter("rad", 0.0, 0.2, 0.003, one_sided=True, deprecated=("steering_play_rad",)),
-        (SWERVE, BICYCLE),
-        (*MOTION, HEADING),
-        "reversals of the steering",
-        inverse=Inverse(("steering",), undo=_undo_steering_backlash),
-        stage=Stage.LINKAGE,
-        deprecated=("steering_play",),
-    ),
-    # d(t) = measured angle at t - T (kinematics of a planar robot)
-    # Taken off: stamp t + T
-    effect(
-        "steering_delay",
-        Parameter("s", 0.0, 0.5, 0.01),
-        (SWERVE, BICYCLE),
-        (*MOTION, HEADING),
-        "steps of the steering",
-        inverse=Inverse(("steering",), STAMPS, Combine.ADDED),
-        stage=Stage.LINKAGE,
-    ),
-    # w(t) = what the wheels ask for at t - T (pure delay)
-    # Taken off: right minus left wheel speed of t - T
-    effect(
-        "yaw_delay",
-        Parameter("s", 0.0, 0.5, 0.01),
-        SKIDDING,
-        (GYRO, SPEED_Y, HEADING),
-        "steps of the yaw rate",
-        inverse=Inverse(("wheels",), undo=_undo_yaw_delay),
-        words=_late("the robot turning"),
-    ),
-    # == Sensors: they change what a log holds of a motion; most of them nothing else
-    # gyro = w + b (IEEE Std 952)
-    # 3 deg/s, the zero error of MEMS gyros as data sheets have it (Bosch BMI055: 1 deg/s)
-    # Taken off: gyro - b where the description has no home; fused yaw - b t
-    _described_sensor(
-        "gyro_bias",
-        Parameter("radps", -0.05, 0.05, 0.001, scatter_rank=1),
-        WITH_IMU,
-        (GYRO,),
-        "standstill; several runs, since every power-on has a bias of its own",
-        homes=(Home("sensors", "gyro_bias_z_radps", Combine.ADDED),),
-        inverse=Inverse(("imu",), undo=_undo_gyro),
-    ),
-    # gyro = (1 + k) w (IEEE Std 952)
-    # data sheets of MEMS gyros have 1 to 4 %; a part that is off by more than 15 % is broken
-    # Taken off: (gyro - bias) / (1 + k) + bias; fused yaw / (1 + k)
-    _sensor(
-        "gyro_scale",
-        Parameter("ratio", -0.15, 0.15, 0.01, as_percent=True, is_error=True),
-        WITH_IMU,
-        (GYRO,),
-        "turns, and an absolute heading on a skid-steer robot",
-        inverse=Inverse(("imu",), undo=_undo_gyro),
-        twins=(("effective_track", HEADING),),
-        words=_sided(100.0, "a gyro that reads {number} % too {side}", "much", "little"),
-    ),
-    # accelerometer = a_x + g sin th + b (IEEE Std 1293)
-    # Taken off: accelerometer - b
-    _described_sensor(
-        "accel_bias",
-        Parameter("mps2", -2.0, 2.0, 0.02, scatter_rank=2),
-        WITH_IMU,
-        (ACCEL,),
-        "several runs, since every power-on has a bias of its own",
-        homes=(Home("sensors", "accel_bias_x_mps2", Combine.ADDED, scaled_by="accel_scale_x_ratio"),),
-        inverse=Inverse(("imu",), ("accel_x_",), Combine.SUBTRACTED, without_home=True),
-        aliases=("accelerometer_mounting_pitch",),
-    ),
-    # gyro, accelerometer and tilt(t) = what they measure at t - T (pure delay; the samples of one IMU
-    # arrive together)
-    # as much of it and of camera_latency is a clock_offset: logs determine two of the three
-    # Taken off: stamp t - T
-    effect(
-        "imu_latency",
-        Parameter("s", 0.0, 0.5, 0.005),
-        WITH_IMU,
-        (GYRO, ACCEL),
-        "steps of the yaw rate, and a camera that is not late",
-        homes=(Home("sensors", "imu_latency_s", Combine.ADDED),),
-        inverse=Inverse(("imu",), STAMPS, Combine.SUBTRACTED, without_home=True),
-        stage=Stage.DESCRIPTION,
-        words=_late("the IMU"),
-    ),
-    # camera(t) = what it sees at t - T (pure delay)
-    # measured: 0.16 s (Husky) and 0.3 to 0.5 s (Warthog), poses of a lidar's scans, DRIVE
-    _described_sensor(
-        "camera_latency",
-        Parameter("s", 0.0, 1.0, 0.005),
-        EVERY,
-        (SPEED_X, SPEED_Y, HEADING),
-        "accelerations at two frequencies",
-        homes=(Home("camera", "latency_s", Combine.ADDED),),
-        words=_late("the camera or lidar"),
-    ),
-    # camera = R(-a) (v_x, v_y): mounted turned to the left by -a, v_y grows by a v (kinematics of a
-    # planar robot)
-    # Taken off: R(a) of what the camera measured; yaw of a pose + a
-    _sensor(
-        "camera_yaw",
-        Parameter("rad", -0.3, 0.3, 0.005),
-        EVERY,
-        (SPEED_X, SPEED_Y),
-        "straight, on more than one side slope",
-        inverse=Inverse(("odometry", "lidar", "pose"), undo=_undo_camera_yaw, act=_act_camera_yaw),
-        words=_sided(math.degrees(1.0), "the camera turned {number}° to the {side}", "right", "left"),
-    ),
-    # v_x - l_y w, v_y + l_x w at the camera (kinematics of a planar robot)
-    Effect(
-        "lever_arm",
-        tuple(
-            Parameter(
-                f"{name}_m", -1.0, 1.0, 0.02, (Home("camera", f"{name}_m", Combine.ADDED),), is_error=True
-            )
-            for name in ("lever_x", "lever_y")
-        ),
-        EVERY,
-        (SPEED_X, SPEED_Y),
-        "turns to both sides",
-        sensed_only=True,
-        stage=Stage.DESCRIPTION,
-        words=_lever_arm,
-    ),
-    # IMU and camera stamp t' = t + T; wheels, currents and steering t: for T < 0 these are the late ones
-    # (two loggers without a common clock)
-    # Taken off: stamp t' - T
-    effect(
-        "clock_offset",
-        Parameter("s", -0.5, 0.5, 0.005),
-        WITH_IMU,
-        (*MOTION, HEADING),
-        "switching manoeuvres",
-        inverse=Inverse(OTHER_LOGGER, STAMPS, Combine.SUBTRACTED),
-        stage=Stage.SENSORS,
-        words=_late("the other sensors logged", "the wheels logged"),
-    ),
-    # IMU and camera stamp t' = (1 + r) t (two loggers without a common clock)
-    # Taken off: stamp t' / (1 + r), from the first stamp of the wheels
-    effect(
-        "clock_rate",
-        Parameter("ratio", -0.02, 0.02, 0.0005, as_percent=True, is_error=True),
-        WITH_IMU,
-        (*MOTION, HEADING),
-        "switching manoeuvres from the start of a run to its end",
-        inverse=Inverse(OTHER_LOGGER, STAMPS, Combine.OVER),
-        stage=Stage.SENSORS,
-    ),
-    # T d(measured)/dt + measured = wheel rate (first-order low-pass)
-    effect(
-        "encoder_lag",
-        Parameter("s", 0.0, 0.5, 0.005),
-        WITH_IMU,
-        (*MOTION, CURRENT, TURNING_CURRENT, HEADING),
-        "accelerations",
-        homes=(Home("sensors", "encoder_time_constant_s", Combine.ADDED),),
-        stage=Stage.DESCRIPTION,
-    ),
-    # == Slip and resistance
-    # w = dv / (B (1 + e)) (Mandow et al., Experimental kinematics for wheeled skid-steer mobile robots,
-    # IROS 2007)
-    effect(
-        "effective_track",
-        Parameter("ratio", -0.5, 4.0, 0.02, scatter_rank=9, as_percent=True, is_error=True),
-        SKIDDING,
-        (GYRO, SPEED_Y, HEADING),
-        "turns in place and in arcs, and an absolute heading",
-        homes=(Home("", "track_m", Combine.TIMES),),
-        twins=(("gyro_scale", HEADING),),
-        words=_track,
-    ),
-    # dv loses D = k q dv, shared as u_r = D a/(a+b), u_l = -D b/(a+b), a = |v_r|^(1-n), b = |v_l|^(1-n),
-    # n = 0.5 (Endo et al., IROS 2007, as in Yamauchi et al., (27) written without its singular points;
-    # the size of D is this project's)
-    effect(
-        "turning_slip",
-        Parameter("ratio", -0.5, 0.9, 0.02),
-        SKIDDING,
-        (*MOTION, HEADING),
-        "arcs of several radii and turns in place",
-    ),
-    # n = 0.5 + e in turning_slip (Endo et al., IROS 2007, as in Yamauchi et al., (27))
-    # n from 0, in proportion to the speeds, to 1, alike; Endo et al. fitted one to each ground
-    effect(
-        "turning_slip_power",
-        Parameter("ratio", -0.5, 0.5, 0.02),
-        (TRACKED,),
-        (SPEED_X, ACCEL, CURRENT),
-        "arcs of several radii with much turning slip",
-        modifies="turning_slip",
-    ),
-    # w grows by x/(1 + x), x = c (u w)^2 / (1 + (w / w0)^2), w0 = 1 rad/s, u and w without it (lateral
-    # acceleration moves the centre of rotation ahead by s0, about c' u (turn_side_slip), and the moment
-    # that resists turning falls with (2 s0 / L)^2: Wong, Theory of Ground Vehicles, skid-steering at high
-    # speeds; that it builds up with w, and the bounded form, are this project's)
-    # measured: 0.03 to 0.045 s^2/m^2 (Warthog on asphalt and gravel, up to 3.5 m/s and 2.8 rad/s); it
-    # goes with 1/mu^2, and would be 2 at mu = 0.1
-    effect(
-        "track_narrowing",
-        Parameter("s2pm2", 0.0, 2.0, 0.02),
-        SKIDDING,
-        (GYRO, SPEED_Y, HEADING),
-        "fast arcs, and turns in place",
-        words=_fast_turns,
-    ),
-    # u / (1 + c w^2) in place of u, about u (1 - c w^2), and that itself for c < 0; w as simulated, with
-    # the effective track (second-order loss of speed in turns, as in the logs of Baril et al., DRIVE,
-    # ICRA 2024; the bounded form is this project's)
-    # measured: 0.02 to 0.1 s^2 (Warthog on asphalt and sand), 0.6 to 0.9 s^2 (Husky)
-    effect(
-        "turn_drag",
-        Parameter("s2", -0.1, 3.0, 0.005),
-        SKIDDING,
-        (SPEED_X,),
-        "arcs of several yaw rates",
-        words=_turn_drag,
-    ),
-    # v = u - |u| c f (linear part of any thrust curve; Wong, Theory of Ground Vehicles)
-    _contact(
-        "force_slip",
-        Parameter("ratio", -0.3, 3.0, 0.02, scatter_rank=8),
-        EVERY,
-        (SPEED_X, SPEED_Y),
-        "slopes and accelerations",
-    ),
-    # f = f_max (1 - K/(s l) (1 - exp(-s l/K))), with K/l = c f_max / 2 so that c is its slip per force at
-    # the start (Janosi and Hanamoto 1961, as integrated along the contact (Yamauchi et al., (17),
-    # corrected))
-    _contact(
-        "shear_slip",
-        Parameter("ratio", 0.0, 3.0, 0.02),
-        WITH_IMU,
-        (SPEED_X, SPEED_Y),
-        "tractions over half of f_max, of both small and large size",
-    ),
-    # resistance grows by b |s| W (Lyasko, Slip sinkage effect in soil-vehicle mechanics, J.
-    # Terramechanics 2010: linear in slip)
-    _contact(
-        "slip_resistance", Parameter("ratio", 0.0, 5.0, 0.05), BOTH, (CURRENT, SPEED_X), "a range of slip"
-    ),
-    # resistance grows by c W (Wong, Theory of Ground Vehicles)
-    # without currents it shows by the slip that it takes, as a smaller wheel radius does
-    _contact(
-        "rolling_resistance",
-        Parameter("ratio", -0.05, 0.5, 0.005, scatter_rank=7),
-        BOTH,
-        (CURRENT, SPEED_X),
-        "several speeds, forward and backward",
-    ),
-    # resistance grows by c v (viscous friction of bearings and gears)
-    _contact("viscous_drag", Parameter("nspm", 0.0, 500.0, 3.0), BOTH, (CURRENT, SPEED_X), "three speeds"),
-    # == Load and motors
-    # mass m (1 + p) (Newton)
-    effect(
-        "payload",
-        Parameter("ratio", -0.5, 1.5, 0.02, as_percent=True),
-        (*BOTH, OMNI),
-        (CURRENT, SPEED_X),
-        "accelerations and slopes",
-        homes=(
-            Home("", "mass_kg", Combine.TIMES),
-            Home("body", "yaw_inertia_kgm2", Combine.TIMES, optional=True),
-        ),
-        stage=Stage.BODY,
-        twins=(("motor_constant", SPEED_X),),
-        beside=((OMNI, "roller_friction"),),
-    ),
-    # current (1 + q) (DC motor: current is torque over its constant)
-    # Taken off: current / (1 + q)
-    _described_sensor(
-        "motor_constant",
-        Parameter("ratio", -0.5, 1.0, 0.01, as_percent=True, is_error=True),
-        BOTH,
-        (CURRENT, TURNING_CURRENT),
-        "accelerations and slopes",
-        homes=(Home("motors", "torque_constant_nmpa", Combine.OVER),),
-        inverse=Inverse(("wheels",), ("current_",), Combine.OVER, without_home=True),
-        twins=(("payload", SPEED_X),),
-    ),
-    # current (1 + q t / 60 s) from the start of a run (remanence of a magnet that warms; linear over a
-    # run)
-    # Taken off: current / (1 + q t / 60 s), from the first stamp of the wheels
-    _sensor(
-        "motor_drift",
-        Parameter("ratio", -0.5, 1.0, 0.01, as_percent=True),
-        BOTH,
-        (CURRENT, TURNING_CURRENT),
-        "long runs",
-        inverse=Inverse(("wheels",), ("current_",), Combine.OVER, drifts=True),
-    ),
-    # current of each motor + b: n b in the sum of n motors, nothing in the difference of the sides (zero
-    # error of a current sensor)
-    # zero of a Hall sensor: up to 2 % of a range of 50 to 200 A
-    # Taken off: current of each motor - b
-    _sensor(
-        "current_offset",
-        Parameter("a", -4.0, 4.0, 0.05),
-        BOTH,
-        (CURRENT,),
-        "standstill, and driving forward and backward",
-        inverse=Inverse(("wheels",), ("current_",), Combine.SUBTRACTED),
-    ),
-    # == Sideways motion
-    # v_y = -c v_x w: to the outside of a turn (m (dv_y/dt + w v_x) = -K v_y with c = m/K; the centre of
-    # rotation lies c v_x ahead: Mandow et al., Experimental kinematics for wheeled skid-steer mobile
-    # robots, IROS 2007)
-    # measured: 0.11 to 0.19 s (Husky; Warthog on asphalt, gravel and sand), DRIVE, as turn_drag
-    effect(
-        "turn_side_slip",
-        Parameter("s", -0.5, 0.5, 0.005),
-        SKIDDING,
-        (SPEED_Y,),
-        "arcs of several speeds, to both sides",
-        words=_sided(
-            EXAMPLE_MPS * EXAMPLE_RADPS,
-            f"a slide of {{number}} m/s to the {{side}} at {EXAMPLE_MPS:g} m/s and {EXAMPLE_RADPS:g} rad/s",
-            *("outside", "inside"),
-        ),
-    ),
-    # T dv_y/dt + v_y = -c v_x w (first-order lag of the lateral motion: the inertia in m (dv_y/dt + w
-    # v_x) = -K v_y)
-    # with the friction of turn_side_slip its time constant would be c, 0.2 s at the most where measured
-    effect(
-        "side_slip_build_up",
-        Parameter("s", 0.0, 1.0, 0.01, one_sided=True),
-        SKIDDING,
-        (SPEED_Y,),
-        "steps of the yaw rate while driving",
-        modifies="turn_side_slip",
-    ),
-    # resistance to rolling and to turning grow by k q W (scrub of skidding wheels; the form in q as EKF
-    # practice has it)
-    effect(
-        "scrub", Parameter("ratio", -0.2, 1.0, 0.005), SKIDDING, (CURRENT, TURNING_CURRENT, SPEED_X), "turns"
-    ),
-    # v_y = -c ph |v| (Yamauchi et al., (2), with the sign that gravity sets)
-    _contact(
-        "side_hill_slip", Parameter("ratio", 0.0, 5.0, 0.05), WITH_IMU, (SPEED_Y,), "both signs of roll"
-    ),
-    # == What makes omni robots slip, and what looks like it
-    # across each wheel G = -r n W v_across / U, beside F = C n W (u - v_along) / U along it (this
-    # project's; docs/measured_slip.md has how it holds on measured runs)
-    effect(
-        "roller_friction",
-        Parameter("ratio", 0.0, 1.5, 0.01),
-        (OMNI,),
-        (SPEED_X, SPEED_Y, HEADING, GYRO, CURRENT),
-        "straight drives in several directions",
-    ),
-    # n_i = (1 + 2 c . p_i / d^2) / 3 of wheels at p_i, d from the middle, with the centre of mass c
-    # (balance of moments)
-    # measured: 16 mm ahead by weights (Robotino)
-    Effect(
-        "load_shift",
-        tuple(
-            Parameter(
-                f"load_shift_{axis}_m",
-                -0.05,
-                0.05,
-                0.001,
-                (Home("body", f"com_{axis}_m", Combine.ADDED),),
-            )
-            for axis in ("x", "y")
-        ),
-        (OMNI,),
-        (SPEED_X, SPEED_Y, HEADING, GYRO),
-        "straight drives in several directions over ground on which the rollers resist",
-        words=_centre_of_mass,
-    ),
-    # w = mean wheel speed / (d (1 + e)) (kinematics of a planar robot)
-    # a tape measures it to a few per cent; measured turns: 0.120 to 0.128 m of 0.125 m (Robotino)
-    effect(
-        "wheel_distance",
-        Parameter("ratio", -0.1, 0.1, 0.005, as_percent=True, is_error=True),
-        (OMNI,),
-        (HEADING, GYRO),
-        "turns",
-        homes=(Home("", "track_m", Combine.TIMES), Home("", "wheelbase_m", Combine.TIMES)),
-        words=_wheel_distance,
-    ),
-    # positions, and speeds over ground, (1 + s) x what they are (a camera above measures in pixels)
-    # Taken off: positions / (1 + s)
-    effect(
-        "camera_scale",
-        Parameter("ratio", -0.3, 0.3, 0.01, as_percent=True, is_error=True),
-        (OMNI,),
-        (SPEED_X, SPEED_Y),
-        "straight drives, and turns to part it from the radius of the wheels",
-        inverse=Inverse(("pose",), ("position_",), Combine.OVER),
-        sensed_only=True,
-    ),
-    # == What makes a car-like robot turn otherwise than its wheels point
-    # d = measured angle + d0 (kinematics of a planar robot)
-    # Taken off: angle + d0
-    effect(
-        "steering_offset_front",
-        Parameter("rad", -0.3, 0.3, 0.005),
-        (BICYCLE,),
-        (GYRO, HEADING),
-        "several speeds and standstill",
-        inverse=Inverse(("steering",), ("angle_front_",), Combine.ADDED),
-    ),
-    # w = v tan d / (L + K v |v|): the front axle yields by K L / (m a) rad/N more, a the distance of the
-    # centre of mass from the rear axle (understeer gradient, Gillespie, Fundamentals of Vehicle Dynamics:
-    # tyres and compliance of the steering alike)
-    # cars have 0.001 to 0.006 s^2/m (1 to 5 deg per g over 9.8 m/s^2); soft tyres on soil more.  Below
-    # the lower bound the front axle of a light robot would be stiffer than rigid
-    effect(
-        "understeer",
-        Parameter("s2pm", -0.01, 0.1, 0.001),
-        (BICYCLE,),
-        (GYRO, HEADING),
-        "arcs of several speeds, to both sides",
-        words=_understeer,
-    ),
-    # stiffness of both axles x (1 + e); so does a load of 1 / (1 + e) - 1, with nothing else to show it
-    # (linear single-track model: Rajamani, Vehicle Dynamics and Control)
-    # load, pressure and ground: a third on loose soil of what it is on firm ground (Wong, Theory of
-    # Ground Vehicles)
-    effect(
-        "cornering_stiffness",
-        Parameter("ratio", -0.7, 2.0, 0.02, as_percent=True, is_error=True),
-        (BICYCLE,),
-        (SPEED_Y, GYRO),
-        "fast arcs to both sides, side slopes and steps of the steering",
-        homes=(Home("", "front_cornering_npr", Combine.TIMES), Home("", "rear_cornering_npr", Combine.TIMES)),
-    ),
-)
+
+def _fixed(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return fields with tuples in place of lists, and of mappings."""
+    fixed = dict(entry)
+    for key, value in entry.items():
+        if isinstance(value, list | dict):
+            fixed[key] = tuple(value.items() if isinstance(value, dict) else value)
+    return fixed
+
+
+#: Every known effect, in the order in which results list them.
+LIBRARY = _read_library(data_folder("effects") / "library.yaml")
 #: Errors of the measured tilt.  They belong to no effect, and are only ever estimated run by run.
 TILT_OFFSETS: tuple[Parameter, ...] = (
     Parameter("pitch_offset_rad", -math.inf, math.inf, 0.005, scatter_rank=3),

@@ -39,7 +39,7 @@ ANY_PRIVATE_WORD = re.compile(rf"(?<![A-Za-z])(?:{'|'.join(PRIVATE_WORDS)})(?![A
 ALLOWED: dict[str, tuple[str, ...]] = {
     "tests/behaviour/commands.py": ("--robot nobody",),
     "tests/terrain/effects/test_catalogue.py": ("steering_play=0.01",),
-    "terrain/effects.py": ('"steering_play"', '"steering_play_rad"'),
+    "data/effects/library.yaml": ("[steering_play]", "[steering_play_rad]"),
     "README.md": ("told:NAME",),
     "CHANGELOG.md": ("told:NAME", "`steering_play`", "`ours`", "`taught_runs`", "`felt_ratio`"),
     "tests/terrain/extension/test_description.py": ('"steering_play"', "steering_play_rad"),

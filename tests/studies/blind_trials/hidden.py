@@ -290,7 +290,7 @@ def scattered_values(
 # -- Logs whose stamps are late, and logs of stalled runs --------------------------------------------------
 
 WHEELS_LOGGER = ("wheels", "steering")
-"""Streams that one logger stamps; others: terrain.effects.OTHER_LOGGER."""
+"""Streams that one logger stamps; others: those of the effect ``clock_offset``."""
 LOGGER_LATE_S = (0.15, 0.4)  #: range of its delay: wheels of measured robots are 0.26 to 0.28 s late
 SENSOR_LATE_S = (0.1, 0.3)  #: range of the delay of one sensor: a measured lidar is 0.16 s late
 STALLED_RATIO = (0.05, 0.15)  #: range of the ratio of runs that are stalled; one at the least

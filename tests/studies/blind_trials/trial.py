@@ -64,7 +64,6 @@ from terrain.effects import (
     GYRO,
     HEADING,
     LIBRARY,
-    OTHER_LOGGER,
     SPEED_X,
     SPEED_Y,
     TURNING_CURRENT,
@@ -357,7 +356,8 @@ def _short(draw: Draw) -> Stage:
 def _late(draw: Draw) -> Stage:
     drives = draw.rich()
     every = limits_of(draw.robot, drives)
-    loggers = ("wheels", WHEELS_LOGGER, -1.0), ("imu and camera", OTHER_LOGGER, 1.0)
+    others = effect_named(CLOCK).parameters[0].inverse.streams  # whom that effect makes late
+    loggers = ("wheels", WHEELS_LOGGER, -1.0), ("imu and camera", others, 1.0)
     variant, names, sign = loggers[draw.turn % 2]
     late_s = float(draw.rng.uniform(*LOGGER_LATE_S))
     alike = confusable_class(every, effect_named(CLOCK), draw.robot.drive)

@@ -14,7 +14,6 @@ from terrain.effects import (
     BOTH,
     CHANNELS,
     CURRENT,
-    EVERY,
     INDEX,
     LIBRARY,
     NUISANCES,
@@ -108,9 +107,12 @@ def responses():
 
 
 def test_names_are_unique_and_entries_are_whole():
-    names = [name for effect in LIBRARY for name in (effect.name, *effect.aliases)]
+    names = [(name, effect) for effect in LIBRARY for name in (effect.name, *effect.aliases)]
     parameters = [p.name for effect in LIBRARY for p in effect.parameters]
-    assert len(set(names)) == len(names)
+    assert len(dict(names)) == len(names)
+    assert all(effect_named(name) is effect for name, effect in names)
+    assert read_effects_of(["encoder_scale=0.02"], "swerve") == {"wheel_radius_ratio": 0.02}
+    assert read_effects_of(["steering_play=0.01"], "swerve") == {"steering_backlash_rad": 0.01}
     assert len(set(parameters)) == len(parameters)
     assert set(PARAMETERS) == {*parameters, *NUISANCES}
     assert [INDEX[name] for name in PARAMETERS] == list(range(len(PARAMETERS)))
@@ -118,9 +120,10 @@ def test_names_are_unique_and_entries_are_whole():
     assert sorted(ranks) == list(range(1, len(NUISANCES) + 1))
     assert set(NUISANCES) == set(spread_numbers("scatter"))
     for effect in LIBRARY:
-        assert set(effect.drives) <= set(EVERY)
+        assert set(effect.drives) <= set(ROBOTS)
         assert set(effect.channels) <= set(CHANNELS)
         assert effect.needs
+        assert effect.source
         assert (effect.stage is None) == (SWERVE not in effect.drives)
         robot = ROBOTS["swerve" if SWERVE in effect.drives else effect.drives[0]]
         for p in effect.parameters:
@@ -134,33 +137,42 @@ def test_names_are_unique_and_entries_are_whole():
 
 
 ADDED = r'''
-import importlib.util, sys, types
+import terrain.files.names as names
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 entry = """
-    effect(
-        "gear_wear",
-        Parameter("ratio", -0.1, 0.1, 0.001, one_sided=True, scatter_rank=10, as_percent=True, is_error=True,
-                  deprecated=("worn_ratio",)),
-        (SWERVE,), (CURRENT,), "z", True, Stage.DESCRIPTION, deprecated=("worn",),
-        homes=(Home("motors", "efficiency_ratio", Combine.TIMES),),
-    ),
-    effect(
-        "ticks", Parameter("ratio", -0.1, 0.1, 0.001), (SWERVE,), (SPEED_X,), "z", True, Stage.SENSORS,
-        inverse=Inverse(("wheels",), undo=lambda block, e: block.values.__imul__(1.0 + e)),
-        words=lambda terms: f"wheels that count {100 * terms[0].total:.0f} % too much",
-    ),
+gear_wear:
+  source: a test
+  parameters:
+    gear_wear_ratio: {low: -0.1, high: 0.1, step: 0.001, one_sided: true, scatter_rank: 10, as_percent: true,
+      is_error: true, deprecated: [worn_ratio], homes: {motors.efficiency_ratio: x (1 + e)}}
+  drives: [swerve]
+  channels: [current_a]
+  needs: z
+  sensed_only: true
+  stage: description
+  deprecated: [worn]
+ticks:
+  source: a test
+  parameters:
+    ticks_ratio: {low: -0.1, high: 0.1, step: 0.001,
+      inverse: {streams: [wheels], columns: [motor_], combine: x (1 + e)}}
+  drives: [swerve]
+  channels: [speed_x_mps]
+  needs: z
+  sensed_only: true
+  stage: sensors
+  words: [sided, 100.0, "wheels that count {number} % too {side}", much, little]
 """
-place = Path(importlib.util.find_spec("terrain").origin).parent / "effects.py"
-module = sys.modules["terrain.effects"] = types.ModuleType("terrain.effects")
-source = place.read_text()
-assert source.count("LIBRARY: tuple[Effect, ...] = (\n") == 1
-source = source.replace("LIBRARY: tuple[Effect, ...] = (\n", "LIBRARY: tuple[Effect, ...] = (\n" + entry)
-exec(compile(source, str(place), "exec"), module.__dict__)
+with TemporaryDirectory() as folder:
+    library, own = names.data_folder("effects") / "library.yaml", names.data_folder
+    Path(folder, "library.yaml").write_text(library.read_text() + entry)
+    names.data_folder = lambda kind: Path(folder) if kind == "effects" else own(kind)
+    import terrain.effects as effects
 
 from dataclasses import replace
 import numpy as np
-import terrain.effects as effects
 from terrain.discrepancy.robot_terms import in_robot_terms, limit_text, quantity
 from terrain.discrepancy import evidence, runs
 from terrain.discrepancy.runs import Simulation
@@ -176,7 +188,7 @@ for table in (effects.BOUNDS, effects.STEPS, effects.NUISANCES, effects.SENSED_O
     assert name in table
 assert name not in effects.nuisances_of("skid_steer")
 assert effects.read_effects_of(["worn=0.05"], "swerve") == {name: 0.05}
-assert Simulation(robot, effects={name: 0.05}, scatter={name: 0.1}).library[0].name == "gear_wear"
+assert Simulation(robot, effects={name: 0.05}, scatter={name: 0.1}).library[-2].name == "gear_wear"
 entry = {"value": 0.05, "unit": "ratio", "source": "test"}
 assert effects.read_effects("here", {"schema": 1, "worn_ratio": entry}, "swerve")[0] == {name: 0.05}
 for extended in (corrected(replace(robot, effects={name: 0.05})), built_with(robot, {name: 0.05})):
@@ -250,14 +262,6 @@ def test_twins_are_mutual_and_differ_in_their_distinguishing_channel(responses):
                 c, both = CHANNELS.index(channel), (responses[drive, e.name] for e in (effect, twin))
                 less, more = sorted(each[c] / each.max() for each in both)
                 assert less < 1e-3 < NOTICEABLE < more
-
-
-def test_an_alias_is_the_effect():
-    for effect in LIBRARY:
-        for name in (effect.name, *effect.aliases):
-            assert effect_named(name) is effect
-    assert read_effects_of(["encoder_scale=0.02"], "swerve") == {"wheel_radius_ratio": 0.02}
-    assert read_effects_of(["steering_play=0.01"], "swerve") == {"steering_backlash_rad": 0.01}
 
 
 @pytest.mark.parametrize(
