@@ -61,7 +61,7 @@ def test_a_robots_program_gets_its_terrain(runs, model_folder, tmp_path, capsys)
     try:
         assert ready.wait(30.0)
         folder = write_run(runs[4], tmp_path)
-        assert example("live_robot").drive(str(folder), service.url.replace("http", "ws"), speed=4.0) == "b"
+        assert example("live_robot").drive(str(folder), service.url.replace("http", "ws"), speed=6.0) == "b"
     finally:
         service.stop()
         thread.join(30.0)

@@ -23,7 +23,7 @@ def test_on_a_straight_path_it_is_8_and_9():
     dt_s, speed, steer, slips = 0.001, 3.0, 0.02, np.array([-0.03, 0.04])
     gains = Gains(4.0, 5e9, 1e-2, excited_mps2=0.0, instrument=False)
     base, arm = ROBOT.wheelbase_m, ROBOT.com_ahead_m
-    time_s = np.arange(3000) * dt_s
+    time_s = np.arange(2000) * dt_s
     turning = speed * (np.tan(steer + slips[0]) - np.tan(slips[1])) / base
     yaw, along = turning * time_s, speed / np.cos(slips[1])  # v of the paper: u = v cos b_R is measured
     x, y = (np.cumsum(along * f(yaw + slips[1])) * dt_s for f in (np.cos, np.sin))

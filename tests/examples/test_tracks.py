@@ -18,7 +18,7 @@ from terrain.terramechanics.traction import bekker_pressure, janosi_force, mobil
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "papers"))
 
-from tracks import grade_resistance, janosi_slip, shear_of_ratio, straight_slip_line, track_balance
+from tracks import janosi_slip, shear_of_ratio, straight_slip_line, track_balance
 
 ROBOT = load_robot("patako")
 SAND = load_soil("toyoura_sand")
@@ -50,12 +50,6 @@ def test_small_slip_is_the_line_and_large_slip_lies_above_it():
     assert track_balance(ROBOT, SAND, 0.4).slip_ratio > 1.3 * (intercept + slope * 0.4)
 
 
-def test_the_compaction_hardly_changes_with_the_slope():
-    level, steep = track_balance(ROBOT, SAND, 0.0), track_balance(ROBOT, SAND, math.radians(25))
-    assert 0.8 < steep.compaction_n / level.compaction_n < 1.0
-    assert steep.grade_n > 10 * steep.compaction_n
-
-
 def test_beyond_reach_there_is_no_slip_and_hard_ground_is_refused():
     assert math.isnan(track_balance(ROBOT, SAND, SAND.friction_angle_rad).slip_ratio)
     with pytest.raises(ConfigError, match="janosi"):
@@ -84,8 +78,3 @@ def test_slip_of_a_force_inverts_the_force():
     forces = [janosi_force(slip, 2000.0, 1.2, 0.02) for slip in slips]
     np.testing.assert_allclose(janosi_slip(forces, 2000.0, 1.2, 0.02), slips, rtol=1e-12)
     assert np.isnan(janosi_slip([2000.0, -2500.0], 2000.0, 1.2, 0.02)).all()
-
-
-def test_the_pull_of_gravity_is_odd_in_the_grade():
-    uphill = grade_resistance(900.0, 0.2)
-    assert uphill == -grade_resistance(900.0, -0.2) == pytest.approx(900 * math.sin(0.2))

@@ -51,10 +51,10 @@ def straights(ground, seed, slopes_rad=(0.0, 0.1, 0.2, 0.3)):
     ]
 
 
-@pytest.mark.parametrize("n", [0.3, 0.5, 0.7, 0.847, 1.0, 1.15, 1.3])
+@pytest.mark.parametrize("n", [0.3, 0.847, 1.3])
 def test_the_exponent_is_found_within_two_hundredths(n):
     ground = PrescribedSlip(turning_loss_ratio=0.36, turning_exponent=n)
-    runs = [run for seed in range(4) for run in turns(ground, 10 * seed + 1, (10, 16, 20, 30))]
+    runs = [run for seed in range(2) for run in turns(ground, 10 * seed + 1, (10, 16, 20, 30))]
     found = fit_turning(slip_samples(runs, ROBOT).turning, D)
     assert found.exponent == pytest.approx(n, abs=0.02)
     assert abs(found.exponent - n) < 4 * found.exponent_std + 0.005  # smoothing sees arcs 0.3 % too slow
@@ -95,9 +95,9 @@ def test_what_was_not_driven_is_named_and_stays_wide():
 
 def test_the_regression_reports_collinear_yaw_rates():
     runs = []
-    for k, slope in enumerate((0.0, 0.09, 0.17, 0.26)):
+    for k, slope in enumerate((0.0, 0.17)):
         for up in (1.6, -1.6):
-            runs += turns(load_soil("dry_sand"), 30 + k, slope=Slope(slope, up))
+            runs += turns(load_soil("dry_sand"), 30 + k, (12, 20, 30), Slope(slope, up))
     samples = slip_samples(runs, ROBOT).turning
     found = fit_turning_angle(samples, D)
     assert found.condition > ILL_CONDITIONED

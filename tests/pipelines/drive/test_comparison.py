@@ -44,18 +44,25 @@ def test_every_controller_has_every_metric_on_any_number_of_processes():
     assert json.dumps(result.as_json(), allow_nan=False) == json.dumps(two.as_json(), allow_nan=False)
 
 
-def test_one_controller_alone_is_driven():
-    for name in ("ramp", "thesis"):
-        found = compare(SHORT.with_(controllers=(name,), seeds=1), INPUTS)
-        assert found.controllers[name]["distance_m"].mean > 2.0
-        assert found.controllers[name]["distance_m"].ci is None
+def test_few_controllers_at_one_seed_and_path_tracking_keeps_the_heading():
+    names = ("fallback", "fallback+track", "ramp")
+    settings = SHORT.with_(
+        controllers=names, seeds=1, duration_s=8.0, radius_factors=(1.0, 1.0, 1.05), ramp_mps2=0.7
+    )
+    result = compare(settings, INPUTS)
+    free, tracked, _ = (result.controllers[name]["yaw_drift_rad"].mean for name in names)
+    assert tracked < 0.3 * free
+    assert result.ramp_mps2 == 0.7
+    for found in result.controllers.values():
+        assert found["distance_m"].mean > 4.0
+        assert found["distance_m"].ci is None
 
 
 @pytest.mark.slow
 def test_traction_control_starts_gently_in_any_direction():
     situation = make_situation("starts", ROBOT, "grass", 301)
     peaks = {}
-    for angle in (0.0, 0.25 * math.pi, 0.5 * math.pi, math.pi):
+    for angle in (0.25 * math.pi, 0.5 * math.pi, math.pi):
         speed = situation.scenario.twist[:, 0]
         twist = np.column_stack([speed * math.cos(angle), speed * math.sin(angle), np.zeros(len(speed))])
         turned = situation._replace(scenario=replace(situation.scenario, twist=twist))
@@ -64,15 +71,7 @@ def test_traction_control_starts_gently_in_any_direction():
             history = drive_history(run, ROBOT, turned.conditions.radius_factors)
             peaks[name, angle] = evaluate_drive(run, history, ROBOT, turned)["slip_peak"]
         assert peaks["plain", angle] > 1.6 * peaks["fallback", angle], angle
-    assert peaks["fallback", 0.5 * math.pi] == pytest.approx(peaks["fallback", 0.0], rel=0.15)
-
-
-def test_a_drive_with_path_tracking_keeps_its_heading():
-    names = ("fallback", "fallback+track")
-    settings = SHORT.with_(controllers=names, duration_s=15.0, leg_backlash_rad=0.02)
-    result = compare(settings, INPUTS)
-    free, tracked = (result.controllers[name]["yaw_drift_rad"].mean for name in names)
-    assert tracked < 0.2 * free
+    assert peaks["fallback", 0.5 * math.pi] == pytest.approx(peaks["fallback", math.pi], rel=0.15)
 
 
 def test_sliding_back_is_negative_distance():
@@ -117,7 +116,7 @@ def test_the_thesis_with_the_true_terrain_drives_on_its_targets():
     """The same as the thesis with a table whose fallback has the targets of that terrain."""
     entry = dict(TABLE.targets["grass"])
     grass = replace(TABLE, targets={**TABLE.targets, TABLE.fallback: entry})
-    settings = SHORT.with_(seeds=1)
+    settings = SHORT.with_(seeds=1, duration_s=5.0)
     adapting = compare(settings.with_(controllers=("thesis:true_terrain+track",)), INPUTS)
     fixed = compare(settings.with_(controllers=("thesis+track",)), DriveInputs(ROBOT, grass))
     (found,), (expected,) = adapting.controllers.values(), fixed.controllers.values()
@@ -137,14 +136,8 @@ def test_the_report_names_every_controller_and_metric_and_what_is_not_known():
         rows[name] = tuple(
             dict(zip(metrics, row, strict=True)) for row in zip(*metrics.values(), strict=True)
         )
-    about = {
-        "scenario": "course",
-        "terrain": "grass",
-        "robot": "agrimaro",
-        "table": "default",
-        "delay_s": 0.05,
-    }
-    about |= {"grade_deg": 0.0, "ramp_mps2": 0.6582, "seeds": (0, 1, 2, 3)}
+    about = {"scenario": "course", "terrain": "grass", "robot": "agrimaro", "table": "default"}
+    about |= {"delay_s": 0.05, "grade_deg": 0.0, "ramp_mps2": 0.6582, "seeds": (0, 1, 2, 3)}
     result = DriveResult(**about, controllers=Comparison("course", rows).means, rows=rows)
     text = terminal_text(result.report, details=True, width=600)
     text = " ".join(text.replace("\N{MINUS SIGN}", "-").replace("\xa0", " ").split())
@@ -166,6 +159,6 @@ def test_the_report_names_every_controller_and_metric_and_what_is_not_known():
 
 def test_a_controller_that_needs_a_classifier_is_not_driven_without():
     situation = make_situation("straight", ROBOT, "grass", 0)
-    for name in ("classified", "classified+track", "thesis:classified"):
+    for name in ("classified+track", "thesis:classified"):
         with pytest.raises(ConfigError, match=f"'{name.replace('+', '.')}' needs a classifier"):
             drive_once(INPUTS, make_controller(name, TABLE, 0.05), situation)

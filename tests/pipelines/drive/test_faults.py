@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipelines.drive.drive import Settings
-from pipelines.drive.faults import bars_text, drawn_cases, drive_faults, fault_figure, fault_loop
+from pipelines.drive.faults import bars_text, drawn_cases, drive_faults, fault_loop
 from pipelines.live.pilot import LivePilot
 from pipelines.report.results import as_json
 from terrain.control.drive_metrics import drive_history, stopping_distance
@@ -33,7 +33,12 @@ ROBOT = load_robot("agrimaro")
 SLIPS = load_slip_table()
 LOOP = fault_loop(ROBOT, SLIPS)
 FEW = Settings(
-    faults="loss_odometry,duplicates_imu", situations="steady", durations_s="3,inf", first_seed=400, n_jobs=1
+    faults="loss_odometry,duplicates_imu",
+    situations="steady",
+    durations_s="3,inf",
+    draw="duplicates_imu",
+    first_seed=400,
+    n_jobs=1,
 )
 
 
@@ -95,13 +100,26 @@ def test_the_result_does_not_depend_on_the_number_of_processes(few):
     assert json.dumps(as_json(few), allow_nan=False) == json.dumps(as_json(two), allow_nan=False)
 
 
-def test_before_a_fault_begins_the_drive_is_the_clean_one():
-    clean, _, start_s = drive_references(LOOP, Place("stop", "wet_floor", 401))
-    drive = drive_case(LOOP, FaultCase("loss_all", 3.0, "stop", "wet_floor", 401))[0]
-    before = drive.time_s < start_s
+def test_a_fault_and_an_exception_of_the_pilot_act_from_when_they_begin_and_show_in_their_row(monkeypatch):
+    step, case = LivePilot.step, FaultCase("loss_imu", 1.0, "steady", "grass", 402)
+    references = drive_references(LOOP, Place(*case[2:]))
+
+    def failing(self, sample):
+        if "imu" not in sample.readings and sample.time_s > 2.0:
+            raise ZeroDivisionError("nothing to divide")
+        return step(self, sample)
+
+    drive = drive_case(LOOP, case)[0]
+    before = drive.time_s < references.start_s
     for name in ("ok", "slip_ratio", "speed_mps", "commanded_mps"):
-        assert np.array_equal(getattr(drive, name)[before], getattr(clean, name)[before], equal_nan=True)
-    assert not np.array_equal(drive.slip_ratio, clean.slip_ratio, equal_nan=True)
+        found, clean = getattr(drive, name), getattr(references.clean, name)
+        assert np.array_equal(found[before], clean[before], equal_nan=True)
+    assert not np.array_equal(drive.slip_ratio, references.clean.slip_ratio, equal_nan=True)
+    monkeypatch.setattr(LivePilot, "step", failing)
+    row = evaluate_case(LOOP, case, references)
+    assert (row.figures.n_exceptions, row.bars["finite"]) == (50, False)
+    assert row.exception == "ZeroDivisionError: nothing to divide"
+    assert row.figures.recovery_s <= 0.02
 
 
 def test_the_report_counts_what_is_met_and_names_what_is_not(few):
@@ -118,25 +136,6 @@ def test_the_report_counts_what_is_met_and_names_what_is_not(few):
     drawn = drawn_cases(few.rows, ("duplicates",))
     assert drawn == [FaultCase("duplicates_imu", math.inf, "steady", "grass", 400)]
     assert all(case.fault == "loss_odometry" for case in drawn_cases(few.rows))
-    references = drive_references(LOOP, Place(*drawn[0][2:]))
-    figure = fault_figure(LOOP, drawn[0], references)
+    (figure,) = few.drawn
     assert figure.title == "duplicates_imu, for good: steady on grass, seed 400"
-    assert figure.panels[0].marks[0].x[0][0] == references.start_s
-
-
-def test_an_exception_of_the_pilot_shows_in_its_row(monkeypatch):
-    step = LivePilot.step
-
-    def failing(self, sample):
-        if "imu" not in sample.readings and sample.time_s > 2.0:
-            raise ZeroDivisionError("nothing to divide")
-        return step(self, sample)
-
-    place = Place("steady", "grass", 402)
-    references = drive_references(LOOP, place)
-    monkeypatch.setattr(LivePilot, "step", failing)
-    row = evaluate_case(LOOP, FaultCase("loss_imu", 1.0, *place), references)
-    assert row.figures.n_exceptions == 50
-    assert row.exception == "ZeroDivisionError: nothing to divide"
-    assert row.bars["finite"] is False
-    assert row.figures.recovery_s <= 0.02
+    assert figure.panels[0].marks[0].x[0][0] == few.clean[0]["start_s"]

@@ -47,57 +47,51 @@ def one(place, change, until_s=math.inf):
 
 def spiky(value):
     def changed(time_s, values):
-        if round(time_s / PERIOD_S) % 25 == 7:
-            values[0] = value
+        values[0] = value if round(time_s / PERIOD_S) % 25 == 7 else values[0]
         return values
 
     return changed
 
 
-@pytest.mark.parametrize(
-    "following",
-    [
+def test_what_follows_with_a_lag_spikes_gaps_or_a_small_error_is_never_off():
+    for following in (
         *({"lag_s": lag_s} for lag_s in (0.0, 0.05, 0.1)),
         *({"change": spiky(value)} for value in (1e3, 1.5, math.nan)),
         {"change": one(4, lambda angle: angle + 0.03, 3.0)},
-    ],
-)
-def test_what_follows_with_a_lag_spikes_gaps_or_a_small_error_is_never_off(following):
-    assert not drive(**following)[1].any()
+    ):
+        assert not drive(**following)[1].any(), following
 
 
 @pytest.mark.parametrize(
     ("place", "change"),
     [
-        (0, lambda mps: 0.0),
-        (1, lambda mps: 1.2 * mps),
-        (2, lambda mps: 0.8 * mps),
-        (0, lambda mps: -mps),
-        (1, lambda mps: 3.0),
-        (3, lambda angle: angle + 0.1),
-        (5, lambda angle: angle - 0.1),
+        *(
+            (0, lambda mps: 0.0),
+            (1, lambda mps: 1.2 * mps),
+            (2, lambda mps: 0.8 * mps),
+            (0, lambda mps: -mps),
+        ),
+        *((1, lambda mps: 3.0), (3, lambda angle: angle + 0.1), (5, lambda angle: angle - 0.1)),
     ],
 )
 def test_what_does_not_follow_is_off_within_a_quarter_of_a_second_and_alone(place, change):
     time_s, off = drive(one(place, change, until_s=3.0))
-    assert not off[:, [i for i in range(6) if i != place]].any()
+    assert not np.delete(off, place, axis=1).any()
     assert not off[time_s < 2.0].any()
     assert off[(time_s >= 2.25) & (time_s < 3.0), place].all()
     assert not off[time_s > 3.5].any()
 
 
-@pytest.mark.parametrize(("place", "frozen"), [(1, 1.0), (5, 0.3)])
-def test_what_stands_while_its_command_changes_is_off(place, frozen):
-    time_s, off = drive(one(place, lambda value: frozen))
-    assert off[time_s > 4.8, place].all()
-    assert not off[time_s < 4.0].any()
-    assert not off[:, [i for i in range(6) if i != place]].any()
+def test_what_stands_while_its_command_changes_is_off_and_what_is_not_measured_is_not():
+    for place, frozen in ((1, 1.0), (5, 0.3)):
+        time_s, off = drive(one(place, lambda value, frozen=frozen: frozen))
+        assert off[time_s > 4.8, place].all()
+        assert not off[time_s < 4.0].any()
+        assert not np.delete(off, place, axis=1).any()
 
-
-def test_what_is_not_measured_is_not_off_and_what_was_off_before_is_over():
-    def change(time_s, values):
+    def lost(time_s, values):
         return one(0, lambda mps: 0.0)(time_s, values) if time_s < 3.0 else None
 
-    time_s, off = drive(change)
+    time_s, off = drive(lost)  # what was off before is over
     assert off[(time_s > 2.3) & (time_s < 3.0), 0].all()
     assert not off[time_s > 3.3].any()

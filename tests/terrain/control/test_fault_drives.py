@@ -64,6 +64,10 @@ def test_a_drive_like_the_clean_one_meets_all_bars_that_apply():
     assert judge(figures(made(), n_not_finite=1), Nature.DEAD)["finite"] is False
 
 
+def body(slip_ratio, start_s, end_s):
+    return {"body_slip_ratio": during(slip_ratio, start_s, end_s)}
+
+
 STOP = np.where(TIME_S >= START_S, 0.0, 1.0)
 BEYOND = np.full(N, math.nan)
 CASES = [
@@ -80,23 +84,9 @@ CASES = [
     ("slip_error", {"slip_ratio": during(0.9, 0, 2)}, {}, {}, {"slip_error_ratio": 0.0}, True),  # before
     ("slip_error", {"true_slip_ratio": BEYOND}, {}, {}, {"slip_error_ratio": math.nan}, None),
     ("slip_error", {"slip_ratio": during(0.22, 4, 4.1)}, {"slip_ratio": during(0.2, 3, 3.1)}, {}, {}, True),
-    (
-        "slip_peak",
-        {"body_slip_ratio": during(0.23, 6, 6.1)},
-        {},
-        {"body_slip_ratio": during(-0.2, 3, 4)},
-        {},
-        True,
-    ),
-    (
-        "slip_peak",
-        {"body_slip_ratio": during(-0.24, 6, 6.1)},
-        {},
-        {"body_slip_ratio": during(0.2, 3, 4)},
-        {},
-        False,
-    ),
-    ("slip_peak", {"body_slip_ratio": during(0.9, 1, 1.1)}, {}, {}, {"slip_peak_ratio": 0.1}, True),
+    ("slip_peak", body(0.23, 6, 6.1), {}, body(-0.2, 3, 4), {}, True),
+    ("slip_peak", body(-0.24, 6, 6.1), {}, body(0.2, 3, 4), {}, False),
+    ("slip_peak", body(0.9, 1, 1.1), {}, {}, {"slip_peak_ratio": 0.1}, True),
     ("stop", {"stop_m": 1.1}, {}, {"stop_m": 1.0}, {"stop_ratio": 1.1}, True),
     ("stop", {"stop_m": 1.11}, {}, {"stop_m": 1.0}, {"stop_ratio": 1.11}, False),
     ("stop", {}, {}, {"stop_m": 1.0}, {"stop_ratio": math.inf}, False),

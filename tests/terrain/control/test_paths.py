@@ -67,8 +67,6 @@ def test_statuses_of_places():
     ("points", "message"),
     [
         (np.empty((0, 2)), "0 different points"),
-        ([[0, 0]], "1 different points"),
-        ([[0, 0], [1, 0]], "2 different points"),
         ([[0, 0], [0, 0], [1, 0], [1, 0]], "2 different points"),
         ([[0, 0], [1, np.nan], [2, 0], [3, 0]], "point 2"),
         ([[0, 0], [5, 0], [10, 0], [5, 0.01]], "turns back"),
@@ -92,12 +90,10 @@ def bend(n=80, radius=12.0):
 
 
 def test_roll_of_a_file_is_that_of_the_path(tmp_path):
-    file = tmp_path / "rolled.csv"
-    points = bend()
+    file, points = tmp_path / "rolled.csv", bend()
     rows = np.column_stack([points, np.linspace(0.0, 0.2, len(points))])
     np.savetxt(file, rows, delimiter=",", header="position_x_m,position_y_m,roll_rad", comments="")
-    path = read_path(file)
-    assert path.roll_rad[[0, -1]] == pytest.approx([0.0, 0.2], abs=0.005)
+    assert read_path(file).roll_rad[[0, -1]] == pytest.approx([0.0, 0.2], abs=0.005)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +103,6 @@ def test_roll_of_a_file_is_that_of_the_path(tmp_path):
         ("a,b\n1,2\n", "columns x_m and y_m"),
         ("x_m,y_m\n0,0\n1,two\n", "row 3 has 'two'"),
         ("x_m,y_m\n0,0\n1\n", "row 3 has 'nothing'"),
-        ("x_m,y_m\n0,0\n1,nan\n2,0\n3,0\n", "point 2"),
         ("x_m,y_m\n0,0\n1,0\n", "2 different points"),
         ("5\n6\n", "two columns"),
         ("x_m,y_m,roll_rad\n0,0,0\n1,0,3\n2,0,0\n3,0,0\n", "roll_rad is beyond"),
@@ -157,7 +152,7 @@ def test_law_is_17():
         assert law_17(SETTINGS, 1.2, *values) == pytest.approx(plain_17(*values))
 
 
-@pytest.mark.parametrize(("front", "rear"), [(0.0, 0.0), (-0.06, -0.04), (0.02, 0.05)])
+@pytest.mark.parametrize(("front", "rear"), [(-0.06, -0.04), (0.02, 0.05)])
 @pytest.mark.parametrize("curvature", [0.0, 0.08])
 def test_deviation_converges_by_its_equation_whatever_the_slip(front, rear, curvature):
     """(2) with known slip under (17): y'' + K_d y' + K_p y = 0 over the distance along the path."""
@@ -175,11 +170,11 @@ def test_deviation_converges_by_its_equation_whatever_the_slip(front, rear, curv
     assert np.array(found) == pytest.approx(0.5 * (1 + 0.4 * s) * np.exp(-0.4 * s), abs=0.01)
 
 
-@pytest.mark.parametrize("speed", [2.0, 5.0])
-def test_predicted_curvature_takes_the_lag_of_the_actuator_out(speed):
+def test_predicted_curvature_takes_the_lag_of_the_actuator_out():
+    speed = 5.0
     path = path_from_curvature(np.array([0.0, 20.0, 24.0, 60.0]), np.array([0.0, 0.0, 0.1, 0.1]))
     errors = {}
-    for horizon in (0.0, 1.0, 3.0):
+    for horizon in (0.0, 1.0):
         settings = SteeringSettings(delay_s=0.0, horizon_time_constants=horizon)
         state, actual, late = SteerState(), 0.0, []
         for s in np.arange(0.0, 40.0, speed * 0.02):

@@ -77,8 +77,7 @@ def small_changes(gains, n_delayed, speed_mps, slip_ratio, slope_ratio, n_sample
     ("numbers", "n_delayed", "where"),
     [
         ((3.5, 1.0), 3, (1.0, 0.13, 0.6)),
-        ((2.0, 0.5), 2, (0.2, -0.2, 0.1)),
-        ((6.0, 0.0), 0, (0.05, 0.2, 0.3)),
+        ((6.0, 0.0), 0, (0.05, -0.2, 0.3)),
         ((4.0, 4.0), 1, (0.1, 0.2, 3.0)),
     ],
 )
@@ -103,10 +102,7 @@ def test_the_margin_is_the_same_at_any_speed():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            {"gains": Gains(2.0, 0.0, 5.0)},
-            r"unstable from 0\.05 to 2 m/s; it is stable up to 0\.76 times",
-        ),
+        ({"gains": Gains(2.0, 0.0, 5.0)}, r"unstable from 0\.05 to 2 m/s; it is stable up to 0\.76 times"),
         ({"delay_s": math.nan}, "^delay_s is nan, 0 to 1 s is required"),
         ({"delay_s": -0.1}, "^delay_s is -0.1"),
         ({"robot": load_robot("husky")}, "^robot husky: its description has no section"),

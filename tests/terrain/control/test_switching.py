@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from features.windows import SteadyMotion
 from terrain.control.switching import (
     DRIVING_MPS,
     NO_BELIEF,
@@ -91,10 +90,6 @@ def test_a_class_is_believed_for_a_bounded_time_of_driving_after_its_last_output
             assert math.isfinite(belief.probability)
         else:
             assert math.isnan(belief.probability)
-
-
-def test_driving_is_what_windows_are_cut_of():
-    assert SteadyMotion().min_speed_mps == DRIVING_MPS
 
 
 finite = st.floats(-1.0, 1.0)
