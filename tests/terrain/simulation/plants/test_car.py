@@ -86,18 +86,13 @@ def test_steering_has_dead_time_rate_and_limit():
     assert (steer <= ROBOT.steering_max_rad).all()
 
 
-@pytest.mark.parametrize(
-    ("distance", "grip", "roll"),
-    [
-        ([0.0, 0.0], [0.5, 0.5], [0, 0]),
-        ([0.0], [0.0], [0.0]),
-        ([0.0], [0.5], [1.0]),
-        ([0.0], [0.5], [np.nan]),
-    ],
-)
-def test_ground_that_cannot_be_is_refused(distance, grip, roll):
-    with pytest.raises(ConfigError, match="ground"):
-        car.ground_grid(car.Ground(np.array(distance), np.array(grip), np.array(roll)))
+def test_ground_that_cannot_be_is_refused():
+    for distance, grip, roll in (
+        *(([0.0, 0.0], [0.5, 0.5], [0, 0]), ([0.0], [0.0], [0.0])),
+        *(([0.0], [0.5], [1.0]), ([0.0], [0.5], [np.nan])),
+    ):
+        with pytest.raises(ConfigError, match="ground"):
+            car.ground_grid(car.Ground(np.array(distance), np.array(grip), np.array(roll)))
 
 
 def weave(sample):
