@@ -15,9 +15,11 @@ import sys
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -129,6 +131,19 @@ def write_model(folder: Path, model: TerrainModel) -> None:
     seal(folder, model.info)
 
 
+@cache
+def skops_io() -> ModuleType:
+    """Return ``skops.io``, without torch and dask, which its walk through scikit-learn imports: two seconds."""
+    unneeded = [f"sklearn.externals.array_api_compat.{name}" for name in ("torch", "dask")]
+    unneeded = [name for name in unneeded if name not in sys.modules]
+    sys.modules |= dict.fromkeys(unneeded)  # type: ignore[arg-type]
+    try:
+        return import_module("skops.io")
+    finally:
+        for name in unneeded:
+            del sys.modules[name]
+
+
 def packed(fitted: Any) -> bytes:
     """Return what a model file holds of fitted parts.
 
@@ -137,9 +152,7 @@ def packed(fitted: Any) -> bytes:
     ModelError
         if one is of a type that could not be read back.
     """
-    from skops import io
-
-    content: bytes = io.dumps(fitted)
+    content: bytes = skops_io().dumps(fitted)
     if foreign := _foreign_type(content):
         raise ModelError(
             f"{foreign} cannot be stored: a model file holds only types that can be checked when it is read, "
@@ -323,8 +336,6 @@ def _network(recipe: WindowPipeline) -> Any:
 
 def _unpacked(content: bytes) -> tuple[WindowPipeline, Novelty | None, SupportTable | None]:
     """Return recipe, novelty score and support of a model file; ``DataError`` says why it is none."""
-    from skops import io
-
     from features.recipes import WindowPipeline
 
     with zipfile.ZipFile(streams.BytesIO(content)) as archive:
@@ -333,7 +344,7 @@ def _unpacked(content: bytes) -> tuple[WindowPipeline, Novelty | None, SupportTa
         raise DataError(f"it unpacks to {unpacked_bytes} bytes, {MAX_UNPACKED_BYTES} are read")
     if foreign := _foreign_type(content):
         raise DataError(f"it holds {foreign}, a type that models of this package do not hold")
-    found = io.loads(content, trusted=list(TRUSTED_TYPES))
+    found = skops_io().loads(content, trusted=list(TRUSTED_TYPES))
     parts = found if isinstance(found, dict) else {"recipe": found}
     recipe, novelty, support = (parts.get(name) for name in ("recipe", "novelty", "support"))
     if not isinstance(recipe, WindowPipeline):
@@ -348,9 +359,7 @@ def _unpacked(content: bytes) -> tuple[WindowPipeline, Novelty | None, SupportTa
 
 def _foreign_type(content: bytes) -> str:
     """Return the first type in a file that is not on the list; empty where all are."""
-    from skops import io
-
-    foreign = sorted(set(io.get_untrusted_types(data=content)) - set(TRUSTED_TYPES))
+    foreign = sorted(set(skops_io().get_untrusted_types(data=content)) - set(TRUSTED_TYPES))
     return printable(foreign[0][:MAX_NAME]) if foreign else ""
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
-from skops import io as skops_io
 
 from features.recipes import WindowPipeline, make_recipe
 from features.windows import SteadyMotion, WindowRule
@@ -21,6 +20,7 @@ from pipelines.learn.model_file import (
     read_files,
     read_model,
     seal,
+    skops_io,
     write_model,
 )
 from terrain.errors import ModelError
@@ -43,7 +43,7 @@ def test_a_saved_model_predicts_the_same_to_the_last_bit(model_dir, windows, mod
     assert np.array_equal(model.recipe.predict_proba(windows), live.predict_proba(windows))
     assert model.recipe.classes_.tolist() == list(model.info.classes) == ["ASPHALT", "GRASS", "GRAVEL"]
     assert model.info.rule == WindowRule(2.0, None, SteadyMotion())
-    assert set(skops_io.get_untrusted_types(file=model_dir / MODEL_FILE)) <= set(TRUSTED_TYPES)
+    assert set(skops_io().get_untrusted_types(file=model_dir / MODEL_FILE)) <= set(TRUSTED_TYPES)
 
 
 @pytest.mark.parametrize("place", [0.0, 0.5, 0.999])
@@ -105,20 +105,20 @@ def pickled_array():
     """Return a model file with an array of objects, which is a pickle in a file of its own."""
     objects = io.BytesIO()
     np.save(objects, np.array([Bomb()], dtype=object), allow_pickle=True)
-    members = members_of(skops_io.dumps(np.arange(3.0)))
+    members = members_of(skops_io().dumps(np.arange(3.0)))
     return archive({name: objects.getvalue() if name.endswith(".npy") else members[name] for name in members})
 
 
 def recipe(first):
-    return skops_io.dumps(WindowPipeline([("first", first), ("last", OTHER)]))
+    return skops_io().dumps(WindowPipeline([("first", first), ("last", OTHER)]))
 
 
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        (lambda: skops_io.dumps(OTHER), "holds a LogisticRegression, not a recipe of this package"),
-        (lambda: skops_io.dumps({"recipe": 3, "novelty": OTHER}), "holds a int, not a recipe"),
-        (lambda: skops_io.dumps(make_recipe("svm")), "holds a recipe that was never fitted"),
+        (lambda: skops_io().dumps(OTHER), "holds a LogisticRegression, not a recipe of this package"),
+        (lambda: skops_io().dumps({"recipe": 3, "novelty": OTHER}), "holds a int, not a recipe"),
+        (lambda: skops_io().dumps(make_recipe("svm")), "holds a recipe that was never fitted"),
         (lambda: recipe(StandardScaler()), "holds a recipe that was never fitted"),
         (
             lambda: recipe(FunctionTransformer(os.mkdir, kw_args={"path": CALLED})),

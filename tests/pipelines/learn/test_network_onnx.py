@@ -8,10 +8,17 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from skops import io
 
 from features.recipes import feature_matrix, make_recipe
-from pipelines.learn.model_file import MODEL_FILE, ONNX_FILE, TRUSTED_TYPES, read_model, seal, write_model
+from pipelines.learn.model_file import (
+    MODEL_FILE,
+    ONNX_FILE,
+    TRUSTED_TYPES,
+    read_model,
+    seal,
+    skops_io,
+    write_model,
+)
 from terrain.classify.network import require_onnx, time_of_onnx
 from terrain.errors import ConfigError, ModelError
 
@@ -42,7 +49,7 @@ def folder(fitted, model_dir):
 def test_a_model_read_back_gives_the_same_bytes(folder, fitted, windows):
     desired = fitted.predict_proba(windows)
     assert np.array_equal(read_model(folder).recipe.predict_proba(windows), desired)
-    assert set(io.get_untrusted_types(file=folder / MODEL_FILE)) <= set(TRUSTED_TYPES)
+    assert set(skops_io().get_untrusted_types(file=folder / MODEL_FILE)) <= set(TRUSTED_TYPES)
     assert (folder / ONNX_FILE).exists() == (getattr(fitted[-1], "network_", fitted[-1]) is not None)
 
 
