@@ -43,7 +43,7 @@ import yaml
 
 from terrain.angles import unwrapped, wrapped
 from terrain.errors import ConfigError
-from terrain.files.documents import check_keys, number
+from terrain.files.documents import check_keys, is_number, numbers
 from terrain.files.names import data_folder
 from terrain.kernels import record
 from terrain.records import Array, read_only
@@ -460,18 +460,18 @@ def _read_library(path: Path) -> tuple[Effect, ...]:
     library = []
     for name, entry in entries.items():
         parameters = []
-        for parameter, numbers in entry["parameters"].items():
+        for parameter, given in entry["parameters"].items():
             homes = []
-            for place, change in numbers.get("homes", {}).items():
+            for place, change in given.get("homes", {}).items():
                 section, _, field = place.rpartition(".")
                 about = change if isinstance(change, dict) else {"combine": change}
                 homes.append(Home(section, field, **about | {"combine": Combine(about["combine"])}))
-            inverse = numbers.get("inverse")
+            inverse = given.get("inverse")
             if inverse is not None:
                 functions = {"undo": UNDO.get(inverse.get("undo")), "act": ACT.get(inverse.get("act"))}
                 combine = Combine(inverse.get("combine", Combine.ADDED))
                 inverse = Inverse(**_fixed(inverse) | functions | {"combine": combine})
-            about = _fixed(numbers) | {"homes": tuple(homes), "inverse": inverse}
+            about = _fixed(given) | {"homes": tuple(homes), "inverse": inverse}
             parameters.append(Parameter(parameter, **about))
         about = _fixed(entry) | {"parameters": tuple(parameters)}
         if "stage" in entry:
@@ -733,8 +733,8 @@ def checked_effects(place: str, values: Mapping[str, float], drive: str) -> dict
                 raise ConfigError(f"{place}: {name} does not apply to a robot with the drive {drive!r}")
             raise ConfigError(f"{place}: {name} is no parameter of an effect (known: {', '.join(known)})")
         low, high = known[name].low, known[name].high
-        plain = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-        if not (plain and math.isfinite(value) and low <= value <= high):
+        plain = value.item() if isinstance(value, np.number) else value
+        if not (is_number(plain) and low <= value <= high):
             raise ConfigError(f"{place}: {name} is {value!r}, a number from {low:g} to {high:g} is required")
     return {name: float(value) for name, value in values.items()}
 
@@ -768,7 +768,7 @@ def read_effects(place: str, described: Any, drive: str) -> tuple[dict[str, floa
     entries = _renamed(place, {k: v for k, v in described.items() if k not in NOT_EFFECTS})
     known = parameters_of(drive)
     checked_effects(place, dict.fromkeys((name for name in entries if name not in known), 0.0), drive)
-    values = {n: number(f"{place}: {n}", entry, known[n].unit, -math.inf) for n, entry in entries.items()}
+    values = numbers(place, entries, dict.fromkeys(entries, -math.inf))
     values = checked_effects(place, values, drive)
     if "covariance" not in described:
         return values, np.full((len(values), len(values)), np.nan)
@@ -797,7 +797,7 @@ def _covariance(place: str, described: Any, names: list[str]) -> Array:
     rows = [[described[row][column] for column in names] for row in names]
     for row, entries in zip(names, rows, strict=True):
         for column, entry in zip(names, entries, strict=True):
-            if isinstance(entry, bool) or not isinstance(entry, int | float) or not math.isfinite(entry):
+            if not is_number(entry):
                 raise ConfigError(f"{place}: {row}, {column} is {entry!r}, a finite number is required")
     return checked_covariance(place, np.array(rows, dtype=float).reshape(len(names), len(names)))
 

@@ -388,7 +388,8 @@ def basis_of(robot: Robot, parameter: str, value: float = 0.0) -> tuple[Basis, .
     for home in PARAMETER[parameter].homes:
         if home.section and home.section not in before.parts:
             continue
-        written = home.field if home.section else robot.spelled.get(home.field, home.field)
+        spelled, factor = robot.spelled.get(home.field, (home.field, 1.0))
+        written = home.field if home.section or factor != 1.0 else spelled
         parts = (each.parts[home.section] if home.section else each for each in (before, after))
         described, extended = (float(getattr(part, home.field)) for part in parts)
         basis = Basis(home.section, home.field, described, extended, Origin.SOURCED, written)

@@ -35,28 +35,26 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, NamedTuple, Self, TypeAlias, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn, Self, TypeAlias, TypeVar
 
 import numpy as np
 
 from terrain.effects import read_effects
 from terrain.errors import ConfigError
-from terrain.files.documents import check_keys, number, read_yaml
-from terrain.files.names import check_name, data_folder, shown
+from terrain.files.documents import check_keys, is_number, numbers, read_yaml
+from terrain.files.names import check_name, data_folder, packaged, shown
 from terrain.records import Array, read_only
 
+#: Part of a range's width that a run may go beyond it: its ends are percentiles, which runs of the same kind
+#: miss by that much.
 MARGIN = 0.1
-"""Part of a range's width that a run may go beyond it: its ends are percentiles, which runs of the same kind
-miss by that much."""
-
+#: Margin of a narrow range: what a logger's noise and an uneven floor make of driving that is the same.
 LEAST_MARGIN = {"wheel_speed_mps": 0.05, "yaw_rate_radps": 0.05, "grade_rad": 0.02}
-"""Margin of a narrow range: what a logger's noise and an uneven floor make of driving that is the same."""
-
+#: Each range in words.
 WORDS = {"wheel_speed_mps": "wheel speed", "yaw_rate_radps": "yaw rate by the wheels", "grade_rad": "slope"}
-"""Each range in words."""
 
 Range = tuple[float, float]
 
@@ -141,7 +139,7 @@ def read_region(place: str, described: Any) -> Region:
         edges = described.get(name)
         if edges is None:
             continue
-        if not isinstance(edges, list) or len(edges) != 2 or not all(map(_is_finite, edges)):
+        if not isinstance(edges, list) or len(edges) != 2 or not all(map(is_number, edges)):
             raise ConfigError(f"{place}: {name} is {edges!r}, two finite numbers are required")
         low, high = float(edges[0]), float(edges[1])
         if low > high:
@@ -150,15 +148,9 @@ def read_region(place: str, described: Any) -> Region:
     return Region(**ranges, terrains=tuple(terrains))
 
 
-def _is_finite(edge: Any) -> bool:
-    return isinstance(edge, int | float) and not isinstance(edge, bool) and math.isfinite(edge)
-
-
-Signed = Annotated[float, -math.inf]
-"""A number of a description that may have any value; a plain ``float`` has to be above zero."""
-
-NotNegative = Annotated[float, 0.0]
-"""A number that may be zero."""
+Signed: TypeAlias = float  #: A number of a description that may have any value.
+NotNegative: TypeAlias = float  #: One that may be zero; a plain ``float`` has to be above zero.
+LEAST: Mapping[Any, float | None] = {"Signed": -math.inf, "NotNegative": 0.0, "float": None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,8 +262,7 @@ class Sensors:
     yaw_std_rad: float
 
 
-Part: TypeAlias = Body | Motors | Steering | Camera | Sensors
-"""Any section of a description."""
+Part: TypeAlias = Body | Motors | Steering | Camera | Sensors  #: Any section of a description.
 
 
 class Equipment(NamedTuple):
@@ -284,13 +275,14 @@ class Equipment(NamedTuple):
     sensors: Sensors
 
 
+#: What each section of a description is read into, by its key in the file.
 KIND_OF_SECTION: Mapping[str, type[Part]] = {
-    kind.__name__.lower(): kind for kind in (Body, Motors, Steering, Camera, Sensors)
+    "body": Body,
+    "motors": Motors,
+    "steering": Steering,
+    "camera": Camera,
+    "sensors": Sensors,
 }
-"""What each section of a description is read into, by its key in the file."""
-
-
-P = TypeVar("P", bound=Part)
 
 
 class Wheel(NamedTuple):
@@ -310,8 +302,8 @@ class Robot(ABC):
     """A wheeled robot; body axes are x forward, y left, z up.
 
     Each kind of drive is a subclass, which says what its wheels are; what follows from them is here.  A section of the
-    description (:attr:`body`, :attr:`motors`, ...) is never None: where the description lacks it, asking for it raises
-    ``ConfigError``.  Code that can do without asks :meth:`describes` first, or takes :meth:`completed`.
+    description is an attribute (:attr:`body`, :attr:`motors`, ...); where the description lacks it, asking for it
+    raises ``ConfigError``.  Code that can do without asks :meth:`describes` first, or takes :meth:`completed`.
 
     Examples
     --------
@@ -335,7 +327,7 @@ class Robot(ABC):
     #: parameters of :mod:`terrain.effects` that are not 0, by name
     effects: Mapping[str, float] = field(default_factory=dict, hash=False)
     #: (n, n) covariance of the effects in their order; NaN where unknown
-    effects_cov: Array = field(default_factory=lambda: np.empty((0, 0)), compare=False)
+    effects_cov: Array = field(default_factory=partial(np.empty, (0, 0)), compare=False)
     region: Region | None = None  #: of driving, that the effects were validated in; None where none is stated
     #: numbers whose source begins with "assumed", as ``track_m`` and ``camera.lever_x_m``
     assumed: frozenset[str] = frozenset()
@@ -344,18 +336,44 @@ class Robot(ABC):
     #: filters and observers that its description lists; none where all of its drive apply
     filters: tuple[str, ...] = ()
 
+    body: Body = field(init=False, repr=False, compare=False)  #: masses and tyres
+    motors: Motors = field(init=False, repr=False, compare=False)  #: and their speed loop
+    steering: Steering = field(init=False, repr=False, compare=False)  #: limits and zeros
+    camera: Camera = field(init=False, repr=False, compare=False)  #: tracking camera
+    sensors: Sensors = field(init=False, repr=False, compare=False)  #: all but the camera
+
+    wheels: tuple[str, ...] = field(init=False, repr=False, compare=False)  #: names, as channels have them
+    #: names of the wheels whose rates are logged, in the order of :attr:`rate_channels`
+    logged_wheels: tuple[str, ...] = field(init=False, repr=False, compare=False)
+    #: channels of the stream ``wheels``: rates of motors, ahead of the reduction, or wheel speeds
+    rate_channels: tuple[str, ...] = field(init=False, repr=False, compare=False)
+    #: whether logs have the rates of motors, and tables those of wheels; else circumferential speeds
+    by_motor: bool = field(init=False, repr=False, compare=False)
+    #: row of each wheel's rate or speed in a table of measurements
+    wheel_rows: tuple[str, ...] = field(init=False, repr=False, compare=False)
+    steered_wheels: tuple[str, ...] = field(init=False, repr=False, compare=False)  #: their names
+    #: row of each wheel's steering angle in a table of measurements, and channels of the stream ``steering``
+    steer_rows: tuple[str, ...] = field(init=False, repr=False, compare=False)
+    steer_channels: tuple[str, ...] = field(init=False, repr=False, compare=False)
+    steered: bool = field(init=False, repr=False, compare=False)  #: whether there is a stream of angles
+    #: whether it drives sideways on wheels that are not steered, each along its own direction
+    on_omni_wheels: bool = field(init=False, repr=False, compare=False)
+    sideways: bool = field(init=False, repr=False, compare=False)  #: whether it can drive sideways
+    #: position (wheels, 2) of each wheel in the body frame
+    wheel_positions_m: Array = field(init=False, repr=False, compare=False)
+    #: direction (wheels,) that each wheel drives along where it is not steered; 0 is ahead
+    wheel_directions_rad: Array = field(init=False, repr=False, compare=False)
+
+    #: numbers that every description of the drive has, beside its sections
     numbers: ClassVar[tuple[str, ...]] = ("wheel_radius_m", "track_m", "wheelbase_m", "mass_kg")
-    """Numbers that every description of the drive has, beside its sections."""
-    spelled: ClassVar[Mapping[str, str]] = MappingProxyType({})
-    """What its descriptions call numbers that have another name here."""
-    drive: ClassVar[str]
-    """The kind of drive, as descriptions name it."""
+    #: what its descriptions have in place of a number here, and by what that is multiplied
+    spelled: ClassVar[Mapping[str, tuple[str, float]]] = MappingProxyType({})
+    drive: ClassVar[str]  #: the kind of drive, as descriptions name it
+    #: sections that a complete description has
     sections: ClassVar[tuple[str, ...]] = ("body", "motors", "camera", "sensors")
-    """Sections that a complete description has."""
-    n_tyres: ClassVar[int]
-    """Tyres that carry the weight."""
+    n_tyres: ClassVar[int]  #: tyres that carry the weight
+    #: whether it turns by skidding, so that the turning moment takes a current of its own
     skids: ClassVar[bool] = False
-    """Whether it turns by skidding, so that the turning moment takes a current of its own."""
 
     def __post_init__(self) -> None:
         n = len(self.effects)
@@ -365,91 +383,49 @@ class Robot(ABC):
         for name, part in self.parts.items():
             if not isinstance(part, KIND_OF_SECTION.get(name, ())):
                 raise TypeError(f"section {name!r} is a {type(part).__name__}")
+        follows: dict[str, Any] = {"effects_cov": read_only(cov), **self.parts}
         for name in ("parts", "effects", "identified"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
-        object.__setattr__(self, "effects_cov", read_only(cov))
+            follows[name] = MappingProxyType(dict(getattr(self, name)))
+        names, x_m, y_m, channels, directions, steered, across = zip(*self.wheel_table(), strict=True)
+        by_motor = any(channel.startswith("motor_") for channel in channels)
+        logged = tuple(name for name, channel in zip(names, channels, strict=True) if channel)
+        turning = tuple(name for name, is_steered in zip(names, steered, strict=True) if is_steered)
+        follows |= {
+            "wheels": names,
+            "logged_wheels": logged,
+            "steered_wheels": turning,
+            "by_motor": by_motor,
+            "rate_channels": tuple(filter(None, channels)),
+            "wheel_rows": tuple(f"wheel_{name}_{'radps' if by_motor else 'mps'}" for name in logged),
+            "steer_rows": tuple(f"steer_{name}_rad" for name in turning),
+            "steer_channels": tuple(f"angle_{name}_rad" for name in turning),
+            "steered": any(steered),
+            "on_omni_wheels": all(across),
+            "sideways": all(np.logical_or(across, steered)),
+            "wheel_positions_m": read_only(np.column_stack([x_m, y_m])),
+            "wheel_directions_rad": read_only(directions),
+        }
+        for name, value in follows.items():
+            object.__setattr__(self, name, value)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> NoReturn:
+            """Refuse what is not there; of sections, which a description may lack, in a sentence."""
+            if name not in KIND_OF_SECTION:
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            raise ConfigError(
+                f"robot {self.name}: its description has no section {name!r}, which is needed here"
+            )
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Travel to another process, which a read-only view of a mapping does not by itself."""
-        values = (getattr(self, item.name) for item in fields(self))
+        values = (getattr(self, item.name) for item in fields(self) if item.init)
         return type(self), tuple(dict(v) if isinstance(v, MappingProxyType) else v for v in values)
 
-    @classmethod
-    def described(cls, name: str, numbers: Mapping[str, float], **also: Any) -> Self:
-        """Return the robot of a description's :attr:`numbers`; ``also`` are other parameters."""
-        own = {written: field for field, written in cls.spelled.items()}
-        also |= {own.get(key, key): value for key, value in numbers.items()}
-        return cls(name=name, **also)
-
-    @cached_property
     @abstractmethod
     def wheel_table(self) -> tuple[Wheel, ...]:
-        """The wheels."""
-
-    @cached_property
-    def wheels(self) -> tuple[str, ...]:
-        """The wheels' names, as channels have them."""
-        return tuple(wheel.name for wheel in self.wheel_table)
-
-    @cached_property
-    def logged_wheels(self) -> tuple[str, ...]:
-        """Names of the wheels whose rates are logged, in the order of :attr:`rate_channels`."""
-        return tuple(wheel.name for wheel in self.wheel_table if wheel.channel)
-
-    @cached_property
-    def rate_channels(self) -> tuple[str, ...]:
-        """Channels of the stream ``wheels``: rates of motors, ahead of the reduction, or wheel speeds."""
-        return tuple(wheel.channel for wheel in self.wheel_table if wheel.channel)
-
-    @cached_property
-    def by_motor(self) -> bool:
-        """Whether logs have the rates of motors, and tables those of wheels; else circumferential speeds."""
-        return self.rate_channels[0].startswith("motor_")
-
-    @cached_property
-    def wheel_rows(self) -> tuple[str, ...]:
-        """Row of each wheel's rate or speed in a table of measurements."""
-        return tuple(f"wheel_{name}_{'radps' if self.by_motor else 'mps'}" for name in self.logged_wheels)
-
-    @cached_property
-    def steered_wheels(self) -> tuple[str, ...]:
-        """Names of the wheels that are steered."""
-        return tuple(wheel.name for wheel in self.wheel_table if wheel.is_steered)
-
-    @property
-    def steered(self) -> bool:
-        """Whether wheels are steered: there is a stream of angles."""
-        return bool(self.steered_wheels)
-
-    @property
-    def steer_rows(self) -> tuple[str, ...]:
-        """Row of each wheel's steering angle in a table of measurements; none without steering."""
-        return tuple(f"steer_{wheel}_rad" for wheel in self.steered_wheels)
-
-    @property
-    def steer_channels(self) -> tuple[str, ...]:
-        """Channels of the stream ``steering``, in the order of :attr:`steer_rows`; none without steering."""
-        return tuple(f"angle_{wheel}_rad" for wheel in self.steered_wheels)
-
-    @cached_property
-    def on_omni_wheels(self) -> bool:
-        """Whether it drives sideways on wheels that are not steered, each along its own direction."""
-        return all(wheel.rolls_across for wheel in self.wheel_table)
-
-    @cached_property
-    def sideways(self) -> bool:
-        """Whether it can drive sideways."""
-        return all(wheel.rolls_across or wheel.is_steered for wheel in self.wheel_table)
-
-    @cached_property
-    def wheel_positions_m(self) -> Array:
-        """Position (wheels, 2) of each wheel in the body frame."""
-        return read_only([[wheel.x_m, wheel.y_m] for wheel in self.wheel_table])
-
-    @cached_property
-    def wheel_directions_rad(self) -> Array:
-        """Direction (wheels,) that each wheel drives along where it is not steered; 0 is ahead."""
-        return read_only([wheel.direction_rad for wheel in self.wheel_table])
+        """Return the wheels."""
 
     @property
     def steering_zeros_rad(self) -> Array:
@@ -465,45 +441,16 @@ class Robot(ABC):
         """Return what :attr:`rate_channels` log of wheel circumferential speeds (..., wheels)."""
         if self.by_motor:
             return np.asarray(wheel_speed_mps / self.wheel_radius_m * self.motors.reduction_ratio)
-        return np.asarray(wheel_speed_mps)[..., [bool(wheel.channel) for wheel in self.wheel_table]]
+        return np.asarray(wheel_speed_mps)[..., np.isin(self.wheels, self.logged_wheels)]
 
     def wheel_speeds_mps(self, rows: Array) -> Array:
         """Return wheel circumferential speeds for values (..., wheels) of :attr:`wheel_rows`."""
         return np.asarray(rows * self.wheel_radius_m if self.by_motor else rows)
 
     @property
-    def body(self) -> Body:
-        """Masses and tyres."""
-        return self._part(Body)
-
-    @property
-    def motors(self) -> Motors:
-        """Motors and the speed loop of their motor drivers."""
-        return self._part(Motors)
-
-    @property
-    def camera(self) -> Camera:
-        """Tracking camera."""
-        return self._part(Camera)
-
-    @property
-    def sensors(self) -> Sensors:
-        """All sensors but the camera."""
-        return self._part(Sensors)
-
-    @property
     def equipment(self) -> Equipment:
         """All sections of the description; ``ConfigError`` where one is missing."""
-        return Equipment(self.body, self.motors, self._part(Steering), self.camera, self.sensors)
-
-    def _part(self, kind: type[P]) -> P:
-        section = kind.__name__.lower()
-        part = self.parts.get(section)
-        if not isinstance(part, kind):
-            raise ConfigError(
-                f"robot {self.name}: its description has no section {section!r}, which is needed here"
-            )
-        return part
+        return Equipment(self.body, self.motors, self.steering, self.camera, self.sensors)
 
     @property
     def encoder_lag_s(self) -> float:
@@ -517,7 +464,7 @@ class Robot(ABC):
     def require(self, *sections: str) -> None:
         """Make sure that the description has the sections named; else ``ConfigError``."""
         for section in sections:
-            self._part(KIND_OF_SECTION[section])
+            getattr(self, section)
 
     def with_parts(self, **parts: Part) -> Self:
         """Return the robot with sections of its description set, by name."""
@@ -535,15 +482,16 @@ class Robot(ABC):
         and no friction, camera and sensors have neither delay nor bias nor lever arm; rates and noise, which
         have no neutral value, are NaN.
         """
-        middle_m = self.wheel_positions_m.mean(axis=0)
-        unlimited = dict.fromkeys(("torque_max_nm", "speed_max_radps"), np.inf)
-        scale = {"reduction_ratio": 1.0, "efficiency_ratio": 1.0, "torque_constant_nmpa": self.wheel_radius_m}
-        neutral: dict[str, Part] = {
-            "body": _neutral(Body, com_x_m=float(middle_m[0]), com_y_m=float(middle_m[1])),
-            "motors": _neutral(Motors, **scale, **unlimited),
-            "camera": _neutral(Camera),
-            "sensors": _neutral(Sensors),
-        }
+        x_m, y_m = self.wheel_positions_m.mean(axis=0).tolist()
+        own = dict.fromkeys(("torque_max_nm", "speed_max_radps"), np.inf) | {"com_x_m": x_m, "com_y_m": y_m}
+        own |= {"reduction_ratio": 1.0, "efficiency_ratio": 1.0, "torque_constant_nmpa": self.wheel_radius_m}
+        neutral: dict[str, Any] = {}
+        for section in ("body", "motors", "camera", "sensors"):
+            values = {}
+            for name in KIND_OF_SECTION[section].__dataclass_fields__:
+                unknown = math.nan if "_std_" in name or name.endswith("_hz") else 0.0
+                values[name] = own.get(name, 1.0 if "_scale_" in name else unknown)
+            neutral[section] = KIND_OF_SECTION[section](**values)
         return replace(self, parts={**neutral, **self.parts})
 
     def check_geometry(self, place: str) -> None:
@@ -555,16 +503,16 @@ class Robot(ABC):
         body = self.body
         if body.footprint_min_m > body.footprint_max_m:
             raise ConfigError(f"{place}: footprint_min_m {body.footprint_min_m} is over footprint_max_m")
-        low_m, high_m = (edge - body.tyre_width_m for edge in (body.footprint_min_m, body.footprint_max_m))
+        low_m, high_m = body.footprint_min_m - body.tyre_width_m, body.footprint_max_m - body.tyre_width_m
         if not low_m <= self.track_m <= high_m:
             raise ConfigError(
                 f"{place}: track_m is {self.track_m:g}; the footprint allows {low_m:g} to {high_m:g} m"
             )
+        if self.n_tyres == 3:
+            self.check_load(place)
 
     def check_load(self, place: str) -> None:
         """Refuse a centre of mass that lifts one of three wheels."""
-        if not self.describes("body"):
-            return
         com_m = [self.body.com_x_m, self.body.com_y_m]
         parts = np.linalg.solve(np.vstack([np.ones(3), self.wheel_positions_m.T]), [1.0, *com_m])
         if parts.min() <= 0:
@@ -572,15 +520,6 @@ class Robot(ABC):
                 f"{place}: the centre of mass ({com_m[0]:g}, {com_m[1]:g}) m lies outside the "
                 f"triangle of the wheels: wheel {int(parts.argmin()) + 1} would carry nothing"
             )
-
-
-def _neutral(kind: type[P], **values: float) -> P:
-    """Return a part that does not act: 0 or, of a scale, 1; NaN for rates and noise."""
-    default = {
-        name: 1.0 if "_scale_" in name else np.nan if "_std_" in name or name.endswith("_hz") else 0.0
-        for name in (item.name for item in fields(kind))
-    }
-    return kind(**(default | values))
 
 
 @dataclass(frozen=True)
@@ -594,9 +533,8 @@ class SkidSteerRobot(Robot):
     n_tyres: ClassVar[int] = 4
     skids: ClassVar[bool] = True
 
-    @cached_property
     def wheel_table(self) -> tuple[Wheel, ...]:
-        """Middle of each side."""
+        """Return the middle of each side."""
         left = Wheel("left", 0.0, self.track_m / 2, "speed_left_mps")
         return left, Wheel("right", 0.0, -self.track_m / 2, "speed_right_mps")
 
@@ -614,7 +552,9 @@ class TrackedRobot(SkidSteerRobot):
     numbers: ClassVar[tuple[str, ...]] = (
         *("sprocket_radius_m", "track_m", "contact_length_m", "track_width_m", "com_height_m", "mass_kg"),
     )
-    spelled = MappingProxyType({"wheel_radius_m": "sprocket_radius_m", "wheelbase_m": "contact_length_m"})
+    spelled = MappingProxyType(
+        {"wheel_radius_m": ("sprocket_radius_m", 1.0), "wheelbase_m": ("contact_length_m", 1.0)}
+    )
     drive: ClassVar[str] = "tracked"
     n_tyres: ClassVar[int] = 2
 
@@ -659,19 +599,14 @@ class SwerveRobot(Robot):
     sections: ClassVar[tuple[str, ...]] = tuple(KIND_OF_SECTION)
     n_tyres: ClassVar[int] = 3
 
-    @cached_property
     def wheel_table(self) -> tuple[Wheel, ...]:
-        """Three wheels."""
+        """Return the three wheels."""
         half_m = self.wheelbase_m / 2
-        return tuple(
-            Wheel(f"{k}", x_m, y_m, f"motor_{k}_radps", is_steered=True)
-            for k, x_m, y_m in ((1, -half_m, 0.0), (2, half_m, 0.0), (3, 0.0, -self.track_m))
+        return (
+            Wheel("1", -half_m, 0.0, "motor_1_radps", is_steered=True),
+            Wheel("2", half_m, 0.0, "motor_2_radps", is_steered=True),
+            Wheel("3", 0.0, -self.track_m, "motor_3_radps", is_steered=True),
         )
-
-    @property
-    def steering(self) -> Steering:
-        """Limits and zeros of the steering."""
-        return self._part(Steering)
 
     @property
     def steering_zeros_rad(self) -> Array:
@@ -682,11 +617,6 @@ class SwerveRobot(Robot):
     def steering_rate_max_radps(self) -> float:
         """Fastest steering rate."""
         return self.steering.rate_max_radps
-
-    def check_geometry(self, place: str) -> None:
-        """Refuse dimensions that no body can have, and a load that lifts a wheel."""
-        super().check_geometry(place)
-        self.check_load(place)
 
 
 @dataclass(frozen=True)
@@ -708,46 +638,32 @@ class OmniRobot(Robot):
     first_wheel_rad: float = math.pi / 3  #: place of the first wheel on the circle, from the x axis
 
     numbers: ClassVar[tuple[str, ...]] = ("wheel_radius_m", "wheel_distance_m", "first_wheel_rad", "mass_kg")
+    spelled = MappingProxyType(
+        {"track_m": ("wheel_distance_m", math.sqrt(3.0)), "wheelbase_m": ("wheel_distance_m", 1.5)}
+    )
     drive: ClassVar[str] = "omni"
     n_tyres: ClassVar[int] = 3
-
-    @classmethod
-    def described(cls, name: str, numbers: Mapping[str, float], **also: Any) -> Self:
-        """Return the robot of a description's numbers; ``also`` are other parameters."""
-        own = dict(numbers)
-        distance_m = own.pop("wheel_distance_m")
-        return super().described(
-            name, own | {"track_m": math.sqrt(3.0) * distance_m, "wheelbase_m": 1.5 * distance_m}, **also
-        )
 
     @property
     def wheel_distance_m(self) -> float:
         """Distance of each wheel from the body's origin."""
         return self.track_m / math.sqrt(3.0)
 
-    @cached_property
     def wheel_table(self) -> tuple[Wheel, ...]:
-        """Three wheels, each driving counter-clockwise about the origin."""
-        places = (self.first_wheel_rad + 2.0 * np.pi / 3.0 * np.arange(3)).tolist()
-        d, cos, sin = self.wheel_distance_m, np.cos, np.sin
-        return tuple(
-            Wheel(
-                f"{k}",
-                d * float(cos(at)),
-                d * float(sin(at)),
-                f"motor_{k}_radps",
-                at + np.pi / 2,
-                False,
-                True,
-            )
-            for k, at in enumerate(places, 1)
-        )
+        """Return the three wheels, each driving counter-clockwise about the origin."""
+        wheels, d = [], self.wheel_distance_m
+        for k, at in enumerate((self.first_wheel_rad + 2.0 * np.pi / 3.0 * np.arange(3)).tolist(), 1):
+            x_m, y_m = d * float(np.cos(at)), d * float(np.sin(at))
+            wheels.append(Wheel(f"{k}", x_m, y_m, f"motor_{k}_radps", at + np.pi / 2, rolls_across=True))
+        return tuple(wheels)
 
     def check_geometry(self, place: str) -> None:
         """Refuse dimensions that no body can have, and a load that lifts a wheel."""
         if self.wheel_distance_m <= 0:
             raise ConfigError(f"{place}: wheel_distance_m must be above zero")
-        if self.describes("body") and 2.0 * self.wheel_distance_m > self.body.footprint_max_m:
+        if not self.describes("body"):
+            return
+        if 2.0 * self.wheel_distance_m > self.body.footprint_max_m:
             raise ConfigError(
                 f"{place}: wheel_distance_m is {self.wheel_distance_m:g}; the footprint allows up to "
                 f"{self.body.footprint_max_m / 2.0:g} m"
@@ -787,9 +703,8 @@ class BicycleRobot(Robot):
     sections: ClassVar[tuple[str, ...]] = ("sensors",)
     n_tyres: ClassVar[int] = 4
 
-    @cached_property
     def wheel_table(self) -> tuple[Wheel, ...]:
-        """Front and rear wheel; the rear axle is the body's origin."""
+        """Return front and rear wheel; the rear axle is the body's origin."""
         front = Wheel("front", self.wheelbase_m, 0.0, is_steered=True)
         return front, Wheel("rear", 0.0, 0.0, "speed_rear_mps")
 
@@ -848,11 +763,13 @@ def as_drive(kind: type[_R], robot: Robot, refusal: str) -> _R:
     return robot
 
 
+#: The type of each drive.
 KIND_OF_DRIVE: dict[str, type[Robot]] = {
     kind.drive: kind for kind in (SkidSteerRobot, TrackedRobot, SwerveRobot, OmniRobot, BicycleRobot)
 }
-"""The type of each drive."""
 
+#: Numbers of the section ``identified``, which logs of one robot showed and no nominal figure is: the least
+#: value of each, None for above zero (:mod:`terrain.calibration.skid_steer`, :mod:`terrain.calibration.omni`).
 IDENTIFIED: Mapping[str, float | None] = {
     "rolling_radius_m": None,
     "effective_track_m": None,
@@ -860,9 +777,6 @@ IDENTIFIED: Mapping[str, float | None] = {
     "wheels_delay_s": -math.inf,
     "wheel_distance_m": None,
 }
-"""Numbers of the section ``identified``, which logs of one robot showed and no nominal figure is: the least
-value of each, None for above zero (:mod:`terrain.calibration.skid_steer`,
-:mod:`terrain.calibration.omni`)."""
 
 
 def load_robot(name_or_path: str | Path) -> Robot:
@@ -885,8 +799,9 @@ def load_robot(name_or_path: str | Path) -> Robot:
     """
     name = str(name_or_path)
     if name not in _READ:
-        robot = robot_from(*read_description(name_or_path))
-        if name not in robot_names():
+        path = description_file(name_or_path)
+        robot = robot_from(path.name, read_yaml(path))
+        if name != path.stem:  # a path: the file may change
             return robot
         _READ[name] = robot
     return _READ[name]
@@ -896,18 +811,12 @@ def load_robot(name_or_path: str | Path) -> Robot:
 _READ: dict[str, Robot] = {}
 
 
-def read_description(name_or_path: str | Path) -> tuple[str, Any]:
-    """Return the file name and the YAML content of a robot's description, unchecked."""
-    path = description_file(name_or_path)
-    return path.name, read_yaml(path)
-
-
 def description_file(name_or_path: str | Path) -> Path:
     """Return the file of a robot's description: the path itself, or that of a robot of the package."""
     path = Path(name_or_path)
     if path.suffix in (".yaml", ".yml"):
         return path
-    known = robot_names()
+    known = packaged("robots")
     if str(name_or_path) not in known:
         raise ConfigError(
             f"robot {shown(str(name_or_path))} is unknown: give one of {', '.join(known)}, or a .yaml file"
@@ -915,34 +824,28 @@ def description_file(name_or_path: str | Path) -> Path:
     return data_folder("robots") / f"{name_or_path}.yaml"
 
 
-def robot_names() -> tuple[str, ...]:
-    """Return the names of the robots that travel with the package."""
-    return tuple(sorted(file.stem for file in data_folder("robots").glob("*.yaml")))
+def robot_named(name: str, given: Robot | None = None) -> Robot:
+    """Return the robot that a log names: the one that is given, where it bears the name, else the package's.
 
-
-def packaged_robot(name: str) -> Robot:
-    """Return a robot of the package by the name that a log gives: a name, never the path of a file.
+    A log gives a name, never the path of a file.
 
     Examples
     --------
-    >>> packaged_robot("husky").drive
+    >>> robot_named("husky").drive
     'skid_steer'
-    >>> packaged_robot("/tmp/husky.yaml")
+    >>> robot_named("/tmp/husky.yaml")
     Traceback (most recent call last):
     terrain.errors.ConfigError: robot '/tmp/husky.yaml' is unknown: a log names one of adap2e, ...
     """
-    known = robot_names()
+    if given is not None and given.name == name:
+        return given
+    known = packaged("robots")
     if name not in known:
         raise ConfigError(
             f"robot {shown(name)} is unknown: a log names one of {', '.join(known)}, or the one whose "
             ".yaml file is given"
         )
     return load_robot(name)
-
-
-def robot_named(name: str, given: Robot | None) -> Robot:
-    """Return the robot that a log names: the one that is given, where it bears the name, else the package's."""
-    return given if given is not None and given.name == name else packaged_robot(name)
 
 
 def robot_from(file: str, described: Any) -> Robot:
@@ -957,26 +860,25 @@ def robot_from(file: str, described: Any) -> Robot:
     check_name(f"{file}: name", name, ConfigError)
     if not isinstance(drive, str) or drive not in KIND_OF_DRIVE:
         raise ConfigError(f"{file}: drive {shown(drive)} is unknown: use one of {', '.join(KIND_OF_DRIVE)}")
-    numbers = {key: number(f"{file}: {key}", described[key], _unit(key)) for key in kind.numbers}
-    parts = {
-        section: _part(f"{file}: {section}", part, described[section])
-        for section, part in KIND_OF_SECTION.items()
-        if described.get(section) is not None
-    }
     entries = {key: described[key] for key in kind.numbers}
-    for section in parts:
-        entries |= {f"{section}.{key}": entry for key, entry in described[section].items()}
+    own, parts = numbers(file, entries, dict.fromkeys(kind.numbers)), {}
+    for section, part in KIND_OF_SECTION.items():
+        if described.get(section) is not None:
+            place, lows = f"{file}: {section}", {item.name: LEAST[item.type] for item in fields(part)}
+            check_keys(place, described[section], list(lows))
+            parts[section] = part(**numbers(place, described[section], lows))
+            entries |= {f"{section}.{key}": entry for key, entry in described[section].items()}
     assumed = frozenset(k for k, e in entries.items() if e["source"].strip().lower().startswith("assumed"))
     shown_by_logs, filters = described.get("identified", {}), described.get("filters", [])
     check_keys(f"{file}: identified", shown_by_logs, [], optional=tuple(IDENTIFIED))
-    identified = {
-        key: number(f"{file}: identified: {key}", entry, _unit(key), IDENTIFIED[key])
-        for key, entry in shown_by_logs.items()
-    }
+    lows = {key: IDENTIFIED[key] for key in shown_by_logs}
+    identified = numbers(f"{file}: identified", shown_by_logs, lows)
     if not isinstance(filters, list) or not all(isinstance(name, str) and name for name in filters):
         raise ConfigError(f"{file}: filters is {shown(filters)}, a list of names is required")
-    also = {"parts": parts, "assumed": assumed, "identified": identified, "filters": tuple(filters)}
-    robot = kind.described(name, numbers, **also)
+    also: dict[str, Any] = {key: own[key] for key in own if key in kind.__dataclass_fields__}
+    also |= {field: factor * own[key] for field, (key, factor) in kind.spelled.items()}
+    also |= {"parts": parts, "assumed": assumed, "identified": identified, "filters": tuple(filters)}
+    robot = kind(name, **also)
     if "effects" in described:
         effects, cov = read_effects(f"{file}: effects", described["effects"], drive)
         stated = described["effects"].get("region")
@@ -984,18 +886,3 @@ def robot_from(file: str, described: Any) -> Robot:
         robot = replace(robot, effects=effects, effects_cov=cov, region=region)
     robot.check_geometry(file)
     return robot
-
-
-def _part(place: str, kind: Any, described: Any) -> Any:
-    hints = get_type_hints(kind, include_extras=True)
-    check_keys(place, described, list(hints))
-    return kind(
-        **{
-            key: number(f"{place}: {key}", described[key], _unit(key), *getattr(hint, "__metadata__", ()))
-            for key, hint in hints.items()
-        }
-    )
-
-
-def _unit(key: str) -> str:
-    return key.rpartition("_")[2]

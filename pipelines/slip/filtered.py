@@ -36,7 +36,7 @@ from terrain.estimation.estimate import (
 from terrain.estimation.models.skid import stuck_intervals
 from terrain.kinematics.wheels import no_slip_twist
 from terrain.records import GATED, Array, RunLog
-from terrain.robots import Robot, packaged_robot
+from terrain.robots import Robot, robot_named
 
 if TYPE_CHECKING:
     from pipelines.slip.estimate import EstimateOptions
@@ -71,7 +71,7 @@ def estimate_all(
         variance, tuned = tuned_noise(runs, robot, name, options.tune_on)
 
     def robot_of(run: RunLog) -> Robot:
-        return robot or packaged_robot(run.robot)
+        return robot or robot_named(run.robot)
 
     def estimate(run: RunLog) -> tuple[Any, RunLog, Pictures]:
         found = estimate_run(run, robot_of(run), name, tuning=tuning, process_variance=variance)

@@ -38,7 +38,7 @@ from terrain.estimation.observe import (
     with_estimates,
 )
 from terrain.records import Array, RunLog
-from terrain.robots import Robot, packaged_robot
+from terrain.robots import Robot, robot_named
 
 LATE_S = 2.0
 """Time from the start that does not set the limits of an axis: estimates begin where nothing is known."""
@@ -65,7 +65,7 @@ def estimate_all(
         raise ConfigError(f"filter {name!r} takes no slip model: leave --slip-model out")
 
     def observe(run: RunLog) -> tuple[Any, RunLog, Pictures]:
-        own = robot or packaged_robot(run.robot)
+        own = robot or robot_named(run.robot)
         found = observe_run(run, own, name, None if file is None else read_slip_model(file, own.name))
         return summarize_observer(found), with_estimates(found), partial(figures_of, found)
 

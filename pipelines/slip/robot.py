@@ -18,7 +18,8 @@ from terrain.calibration.finding import Finding
 from terrain.calibration.sensors import measurement_variances
 from terrain.errors import ConfigError, DataError
 from terrain.files.atomic import atomic_write
-from terrain.robots import SwerveRobot, read_description, robot_from
+from terrain.files.documents import read_yaml
+from terrain.robots import SwerveRobot, description_file, robot_from
 
 
 class CalibrationResult(Result):
@@ -50,7 +51,8 @@ def calibrate(settings: Settings, progress: Progress) -> CalibrationResult:
         if a run is another robot's, the runs show nothing, or those of a skid-steer robot have no lidar.
     """
     assert settings.robot is not None
-    file, description = read_description(settings.robot)
+    path = description_file(settings.robot)
+    file, description = path.name, read_yaml(path)
     robot = robot_from(file, description)
     if not robot.skids:
         robot.require(*robot.sections)

@@ -26,7 +26,7 @@ from terrain.estimation.filter import Filter, FilterModel, FilterSettings
 from terrain.extension import corrected, corrected_log
 from terrain.identify import Parameter, identify
 from terrain.records import Array, RunLog
-from terrain.robots import Robot, packaged_robot
+from terrain.robots import Robot, robot_named
 
 #: Number of runs to tune on unless they are named: the likelihood of each is evaluated a hundred times.
 MAX_RUNS = 3
@@ -77,7 +77,7 @@ def tuned_noise(
         raise DataError("no run to tune on is named")
     for unknown in (each for each in names if each not in by_id):
         raise DataError(f"there is no run {unknown!r} to tune on; there are {', '.join(by_id)}")
-    robot = robot or packaged_robot(by_id[names[0]].robot)
+    robot = robot or robot_named(by_id[names[0]].robot)
     logs, robot = [corrected_log(by_id[each], robot) for each in names], corrected(robot)
     model = model_of(logs[0], robot, name)
     tables = [measurement_table(run, robot) for run in logs]

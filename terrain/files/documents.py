@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -25,23 +26,44 @@ if TYPE_CHECKING:
 Document = TypeVar("Document", bound="BaseModel")
 
 
-def number(place: str, entry: Any, unit: str, low: float | None = None) -> float:
-    """Return the number of an entry ``{value, unit, source}``, with ``interval`` where it was calibrated.
+def numbers(place: str, entries: Mapping[str, Any], lows: Mapping[str, float | None]) -> dict[str, float]:
+    """Return the numbers of some keys, each in the unit that its key ends in; ``lows`` as of :func:`number`."""
+    found = {}
+    for key, low in lows.items():
+        found[key] = number(f"{place}: {key}", entries[key], key.rpartition("_")[2], low)
+    return found
 
-    ``ConfigError`` where a key is unknown or missing, the unit another, no source there, or the number below ``low``;
-    without one it must be above zero.
+
+def number(
+    place: str,
+    entry: Any,
+    unit: str,
+    low: float | None = None,
+    high: float = math.inf,
+    also: str = "interval",
+) -> float:
+    """Return the number of an entry ``{value, unit, source}``, which may have one more key, ``also``.
+
+    ``ConfigError`` where a key is unknown or missing, the unit another, no source there, or the number below ``low``,
+    without one not above zero, or above ``high``.
     """
-    check_keys(place, entry, ["value", "unit", "source"], optional=("interval",))
+    check_keys(place, entry, ["value", "unit", "source"], optional=(also,))
     if entry["unit"] != unit:
         raise ConfigError(f"{place} has the unit {shown(entry['unit'])}, {unit!r} is required")
     if not isinstance(entry["source"], str) or not entry["source"].strip():
         raise ConfigError(f"{place} has no source: say where the number is from, or 'assumed'")
     value = entry["value"]
-    is_number = not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value)
-    if not is_number or (value <= 0 if low is None else value < low):
+    if not is_number(value) or (value <= 0 if low is None else value < low):
         more = " above zero" if low is None else " from zero up" if low == 0 else ""
         raise ConfigError(f"{place} is {shown(value)}, a number{more} is required")
+    if value > high:
+        raise ConfigError(f"{place} is {float(value):g}, at most {high:g} is accepted")
     return float(value)
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value is a finite number, and no truth value."""
+    return not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value)
 
 
 def check_keys(place: str, entry: Any, desired: list[str], optional: tuple[str, ...] = ()) -> None:

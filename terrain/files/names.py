@@ -145,3 +145,8 @@ def data_folder(kind: str) -> Path:
     package = Path(__file__).parents[1]
     installed = package / "_data" / kind
     return installed if installed.is_dir() else package.parent / "data" / kind
+
+
+def packaged(kind: str) -> tuple[str, ...]:
+    """Return the names of the packaged YAML of one kind."""
+    return tuple(sorted(file.stem for file in data_folder(kind).glob("*.yaml")))

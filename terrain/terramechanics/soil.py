@@ -28,19 +28,21 @@ import numpy as np
 
 from terrain.errors import ConfigError
 from terrain.files.documents import check_keys, number, read_yaml
-from terrain.files.names import data_folder
+from terrain.files.names import data_folder, packaged
 
+#: The numbers of each traction law.
 LAWS: dict[str, tuple[str, ...]] = {
     "janosi": ("cohesion_pa", "friction_angle_rad", "shear_modulus_m"),
     "magic": ("stiffness_ratio", "shape_ratio", "peak_friction_ratio", "curvature_ratio"),
 }
-"""The numbers of each traction law."""
 
 RESISTANCE = ("rolling_resistance_ratio", "slip_sinkage_ratio")
 ROLLERS = "roller_friction_ratio"  #: Of omni wheels: friction of their rollers over the load; may be left out
 
 SINKAGE = ("kc_npmn1", "kphi_npmn2", "sinkage_exponent_ratio")
 
+#: Lowest and highest value of each number, so that an angle in degrees is noticed; None: above zero.
+#: The sinkage of a rigid wheel has no root for an exponent of 3, and near it is no approximation any more.
 RANGES: dict[str, tuple[float | None, float]] = {
     "rolling_resistance_ratio": (0.0, 1.0),
     "slip_sinkage_ratio": (0.0, 5.0),
@@ -57,12 +59,8 @@ RANGES: dict[str, tuple[float | None, float]] = {
     "sinkage_exponent_ratio": (None, 2.0),
     "roller_friction_ratio": (0.0, 2.0),
 }
-"""Lowest and highest value of each number, so that an angle in degrees is noticed; None: above zero.
-
-The sinkage of a rigid wheel has no root for an exponent of 3, and near it is no approximation any more."""
-
+#: The number of each law whose ``field`` is that of the thrust.
 FRICTION = {"janosi": "friction_angle_rad", "magic": "peak_friction_ratio"}
-"""The number of each law whose ``field`` is that of the thrust."""
 
 
 class Scatter(NamedTuple):
@@ -97,18 +95,13 @@ class Soil:
     roller_friction_ratio: float = math.nan  #: of omni wheels' rollers over the load, with any law
     scatter: tuple[Scatter, ...] = ()  #: how numbers differ from run to run and along a run
 
-    @property
-    def thrust_field_ratio(self) -> float:
-        """Coefficient of variation of the thrust along a run: that of the friction; 0 where none is given."""
-        return self._field(FRICTION[self.law])
+    def field_ratios(self) -> tuple[float, float]:
+        """Return coefficients of variation along a run, 0 where none is given.
 
-    @property
-    def resistance_field_ratio(self) -> float:
-        """Coefficient of variation of the resistance along a run: that of rolling; 0 where none is given."""
-        return self._field("rolling_resistance_ratio")
-
-    def _field(self, parameter: str) -> float:
-        return next((entry.field_ratio for entry in self.scatter if entry.parameter == parameter), 0.0)
+        Of the thrust, which is that of the friction, and of the resistance, which is that of rolling.
+        """
+        ratios = {each.parameter: each.field_ratio for each in self.scatter}
+        return ratios.get(FRICTION[self.law], 0.0), ratios.get(RESISTANCE[0], 0.0)
 
 
 def soil_names() -> tuple[str, ...]:
@@ -119,7 +112,7 @@ def soil_names() -> tuple[str, ...]:
     >>> soil_names()
     ('asphalt', 'clay', 'dry_sand', 'firm_soil_gravel', 'grass', 'snow', 'tiles', 'tilled_loam')
     """
-    return tuple(sorted(file.stem for file in data_folder("soils").glob("*.yaml")))
+    return packaged("soils")
 
 
 def extra_soil_names() -> tuple[str, ...]:
@@ -130,7 +123,7 @@ def extra_soil_names() -> tuple[str, ...]:
     >>> extra_soil_names()
     ('digging_sand', 'toyoura_sand', 'wet_floor')
     """
-    return tuple(sorted(file.stem for file in (data_folder("soils") / "extra").glob("*.yaml")))
+    return packaged("soils/extra")
 
 
 def load_soil(name_or_path: str | Path) -> Soil:
@@ -155,12 +148,11 @@ def load_soil(name_or_path: str | Path) -> Soil:
     """
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml"):
-        extra = extra_soil_names()
-        if str(name_or_path) not in (*soil_names(), *extra):
-            known = ", ".join((*soil_names(), *extra))
-            raise ConfigError(f"soil {str(name_or_path)!r} is unknown: give one of {known}, or a .yaml file")
-        folder = data_folder("soils")
-        path = (folder / "extra" if str(name_or_path) in extra else folder) / f"{name_or_path}.yaml"
+        name, extra = str(name_or_path), extra_soil_names()
+        if name not in (known := (*soil_names(), *extra)):
+            names = ", ".join(known)
+            raise ConfigError(f"soil {name!r} is unknown: give one of {names}, or a .yaml file")
+        path = data_folder("soils/extra" if name in extra else "soils") / f"{name}.yaml"
     return soil_from(path.name, read_yaml(path))
 
 
@@ -182,13 +174,21 @@ def soil_from(file: str, described: Any) -> Soil:
     parameters = [*RESISTANCE, "roughness_m3", *LAWS[law], *(SINKAGE if sinks else ())]
     parameters += [ROLLERS] if ROLLERS in described else []
     check_keys(file, described, ["name", "law", *parameters])
-    numbers = {key: _parameter(f"{file}: {key}", key, described[key]) for key in parameters}
-    scatter = tuple(
-        _scatter(f"{file}: {key}: scatter", key, described[key]["scatter"])
-        for key in parameters
-        if "scatter" in described[key]
-    )
-    return Soil(name, law, **numbers, scatter=scatter)
+    values, scatter = {}, []
+    for key in parameters:
+        place, unit = f"{file}: {key}", key.rpartition("_")[2]
+        values[key] = number(place, described[key], unit, *RANGES[key], also="scatter")
+        if "scatter" in described[key]:
+            entry, has_field = described[key]["scatter"], key in (RESISTANCE[0], *FRICTION.values())
+            check_keys(
+                f"{place}: scatter", entry, ["run", "source"], optional=("field",) if has_field else ()
+            )
+            ratios = []
+            for part in ("run", "field"):
+                ratio = {"value": entry.get(part, 0.0), "unit": "ratio", "source": entry["source"]}
+                ratios.append(number(f"{place}: scatter: {part}", ratio, "ratio", 0.0, 1.0))
+            scatter.append(Scatter(key, *ratios))
+    return Soil(name, law, **values, scatter=tuple(scatter))
 
 
 def scattered(soil: Soil, rng: np.random.Generator) -> Soil:
@@ -221,32 +221,3 @@ def scattered(soil: Soil, rng: np.random.Generator) -> Soil:
             value *= factor
         drawn[entry.parameter] = min(value, RANGES[entry.parameter][1])
     return replace(soil, **drawn)
-
-
-def _parameter(place: str, key: str, entry: Any) -> float:
-    check_keys(place, entry, ["value", "unit", "source"], optional=("scatter",))
-    plain = {part: entry[part] for part in ("value", "unit", "source")}
-    return _within(place, plain, key.rpartition("_")[2], *RANGES[key])
-
-
-def _scatter(place: str, key: str, entry: Any) -> Scatter:
-    has_field = key in ("rolling_resistance_ratio", *FRICTION.values())
-    check_keys(place, entry, ["run", "source"], optional=("field",) if has_field else ())
-    ratios = (
-        _within(
-            f"{place}: {part}",
-            {"value": entry.get(part, 0.0), "unit": "ratio", "source": entry["source"]},
-            "ratio",
-            0.0,
-            1.0,
-        )
-        for part in ("run", "field")
-    )
-    return Scatter(key, *ratios)
-
-
-def _within(place: str, entry: dict[str, Any], unit: str, low: float | None, high: float) -> float:
-    value = number(place, entry, unit, low)
-    if value > high:
-        raise ConfigError(f"{place} is {value:g}, at most {high:g} is accepted")
-    return value

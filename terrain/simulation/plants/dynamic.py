@@ -196,7 +196,7 @@ def draw_profile(
     white[:, :, 1:] *= math.sqrt(1.0 - keep**2)
     unit = lfilter([1.0], [1.0, -keep], white, axis=2)
     patch_of_cell = np.searchsorted(start_m, np.arange(n_cells) * FIELD_STEP_M, side="right") - 1
-    ratios = np.array([[soil.thrust_field_ratio, soil.resistance_field_ratio] for soil in used])
+    ratios = np.array([soil.field_ratios() for soil in used])
     spread = ratios[patch_of_cell].T
     field = np.exp(spread[:, None, :] * unit - 0.5 * spread[:, None, :] ** 2)
     roughness = [soil.roughness_m3 * conditions.roughness_factor for soil in used]

@@ -25,7 +25,6 @@ from terrain.effects import (
     HEADING,
     INDEX,
     LIBRARY,
-    MOTION,
     ONE_SIDED,
     SENSED_ONLY,
     SPEED_X,

@@ -17,7 +17,7 @@ from terrain.errors import LogError, TerrainError
 from terrain.files.names import data_folder
 from terrain.logs import tables
 from terrain.logs.run_folders import read_run, write_run
-from terrain.robots import load_robot, packaged_robot
+from terrain.robots import load_robot, robot_named
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_a_log_names_a_robot_of_the_package_or_the_one_that_is_given(tmp_path, m
     monkeypatch.chdir(tmp_path)
     assert load_robot("mule.yaml").name == "mule"
     for name in ("mule.yaml", str(tmp_path / "mule.yaml"), "mule", "../robots/husky", "x" * 10**5):
-        assert "is unknown: a log names one of adap2e, agrimaro" in refusal(packaged_robot, name)
+        assert "is unknown: a log names one of adap2e, agrimaro" in refusal(robot_named, name)
     (tmp_path / "mule.yaml").write_text(text.replace("name: mule", "name: a/b"))
     assert "mule.yaml: name 'a/b' is no plain name" in refusal(load_robot, "mule.yaml")
 
