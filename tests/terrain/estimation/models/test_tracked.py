@@ -19,7 +19,7 @@ from terrain.slip import slip_ratio
 
 ROBOT = load_robot("orchard_ugv")
 D = ROBOT.half_track_m
-HZ, EVERY = 50, 5
+HZ, EVERY = 20, 2
 STRAIGHT = (0.6, 0.6), (0.87, 0.87)
 CIRCLE = (0.4, 0.6), (1.10, 0.80)
 PAPER = TrackedSettings()
@@ -79,14 +79,19 @@ def names(track):
 @pytest.mark.parametrize("gyro", [False, True])
 def test_it_settles_with_the_gains_of_the_paper(drive_of, bars_s, gyro):
     time_s, rows, _, eta = drive(*drive_of, gyro=gyro)
-    found = efficiencies(track_of(time_s, rows))
+    track = track_of(time_s, rows)
+    found = efficiencies(track)
     for ratio, bar_s in zip((0.05, 0.02), bars_s, strict=True):
         assert settling_s(time_s, found, eta, ratio) <= bar_s
     np.testing.assert_allclose(found[-1], eta[-1], atol=2e-4)
+    # excitation is the smallest eigenvalue of M'M, forgotten with the time constant of (14)
+    m = regressor(0.0, *drive_of[0])
+    least, excitation = np.linalg.eigvalsh(m.T @ m)[0], track.state("excitation_mps")
+    assert excitation[-1] ** 2 == pytest.approx(least, rel=1e-3)
+    assert excitation[2 * HZ] ** 2 == pytest.approx(least * -math.expm1(-2 / 5), rel=2e-2)
 
 
-@pytest.mark.parametrize("settings", [PAPER, NORMALISED])
-@pytest.mark.parametrize("drive_of", [STRAIGHT, CIRCLE])
+@pytest.mark.parametrize(("settings", "drive_of"), [(PAPER, STRAIGHT), (NORMALISED, CIRCLE)])
 def test_errors_are_as_large_as_stated(settings, drive_of):
     """Squared errors of pose and efficiencies, normalised by their covariance, average to 1."""
     squares, rng = [], np.random.default_rng(0)
@@ -103,16 +108,6 @@ def test_errors_are_as_large_as_stated(settings, drive_of):
                 squares.append(off @ np.linalg.solve(observer.cov, off) / 5)
     # 12 runs, each at least two independent errors of 5 numbers: 3 * sqrt(2 / 120)
     assert abs(np.mean(squares) - 1) < 0.39
-
-
-def test_excitation_is_the_closed_form():
-    """The smallest eigenvalue of M'M, forgotten with the time constant of (14)."""
-    time_s, rows, *_ = drive(*CIRCLE, 40.0)
-    found = track_of(time_s, rows).state("excitation_mps")
-    m = regressor(0.0, 0.4, 0.6)
-    least = np.linalg.eigvalsh(m.T @ m)[0]
-    assert found[-1] ** 2 == pytest.approx(least, rel=1e-3)
-    assert found[round(2 * HZ)] ** 2 == pytest.approx(least * -math.expm1(-2 / 5), rel=2e-2)
 
 
 @pytest.mark.parametrize(("speeds", "eta"), [((-0.6, -0.5), (0.9, 0.8)), ((-0.4, 0.4), (0.7, 0.9))])
@@ -147,11 +142,10 @@ def test_missing_fixes_are_dead_reckoning_and_long_ones_begin_the_pose_anew(gyro
 
 def test_standing_for_minutes_nothing_drifts():
     rng = np.random.default_rng(0)
-    driven = drive(*STRAIGHT, 60.0, rng, **RAW)
-    observer = TrackedObserver(ROBOT, PAPER)
+    driven, observer = drive(*STRAIGHT, 30.0, rng, **RAW), TrackedObserver(ROBOT, PAPER)
     for row in driven[1]:
         observer.step(row, 1 / HZ)
-    place, rows = driven[2][-1], np.full((6000, 6), np.nan)
+    place, rows = driven[2][-1], np.full((2000, 6), np.nan)
     rows[:, :2] = rng.normal(scale=0.004, size=(len(rows), 2))  # encoders that flicker
     rows[:, 2:5] = place + rng.normal(size=(len(rows), 3)) * [0.02, 0.02, 0.009]
     rows[:, 5] = 0.005 + rng.normal(scale=0.002, size=len(rows))  # a gyro with a bias
@@ -163,7 +157,7 @@ def test_standing_for_minutes_nothing_drifts():
     assert (abs(after.mean[:3] - place) < 4 * after.std[:3]).all()
 
 
-def test_a_track_that_stands_keeps_its_efficiency():
+def test_a_track_that_stands_keeps_its_efficiency_and_a_robot_pushed_on_both_is_named():
     n = 60 * HZ + 1
     left = np.where(np.arange(n) < 40 * HZ, 0.5, 0.0)
     time_s, rows, *_ = drive((left, 0.5), (0.9, 0.8), 60.0)
@@ -174,9 +168,6 @@ def test_a_track_that_stands_keeps_its_efficiency():
     np.testing.assert_allclose(found[-1], [0.9, 0.8], atol=2e-3)
     assert (np.diff(track.slip_std[41 * HZ :, 0]) >= 0).all()
     assert track.state("excitation_mps")[-1] < 0.1 < track.state("excitation_mps")[39 * HZ]
-
-
-def test_a_robot_pushed_while_its_tracks_stand():
     time_s, rows, *_ = drive(*STRAIGHT, 10.0, gyro=True)
     rows[5 * HZ :, :2], rows[5 * HZ :, 2:5], rows[5 * HZ :, 5] = 0.0, np.nan, 0.2
     assert set(names(track_of(time_s, rows))[5 * HZ + 1 :]) == {"PUSHED"}
@@ -186,8 +177,7 @@ def test_ticks_without_speeds_and_pauses_lose_no_travel_that_is_known():
     time_s, rows, *_ = drive(*CIRCLE, 60.0)
     rows[(np.arange(len(rows)) % 7) == 3, 0] = np.nan
     track = track_of(time_s, rows)
-    bad = (np.arange(len(rows)) % 7) == 3
-    assert (np.array(names(track)) == "BAD_INPUT").tolist() == bad.tolist()
+    assert (np.array(names(track)) == "BAD_INPUT").tolist() == np.isnan(rows[:, 0]).tolist()
     np.testing.assert_allclose(efficiencies(track)[-1], CIRCLE[1], atol=2e-3)
     kept = (time_s < 30) | (time_s >= 35)
     paused = track_of(time_s[kept], rows[kept])
@@ -220,20 +210,18 @@ def random_case(rng, normalised=False):
 @pytest.mark.parametrize("normalised", [False, True])
 def test_the_lyapunov_function_never_grows(normalised):
     rng, n_whole = np.random.default_rng(0), 0
-    for _ in range(1000):
+    for _ in range(300):
         travel, span, gain, adaptation = random_case(rng, normalised)
         error, eta, true = rng.normal(size=3), rng.uniform(0, 2, 2), rng.uniform(0, 2, 2)
         after, eta_after, *_ = observe_interval(travel, span, gain, adaptation, error, eta, travel @ true)
-        before_v, after_v = (
-            lyapunov(error, eta - true, adaptation),
-            lyapunov(after, eta_after - true, adaptation),
-        )
+        before_v = lyapunov(error, eta - true, adaptation)
+        after_v = lyapunov(after, eta_after - true, adaptation)
         assert after_v <= before_v * (1 + 1e-9)
         if n_parts(travel, span, gain, adaptation) == 1 and not normalised:
             n_whole, middle = n_whole + 1, (error + after) / 2
             fall = -span * middle @ (gain * middle)
             assert abs(after_v - before_v - fall) < 1e-12 * before_v + 1e-14
-    assert normalised or n_whole > 30
+    assert normalised or n_whole > 10
 
 
 def test_maps_of_the_errors_are_derivatives_of_the_step():
