@@ -9,9 +9,9 @@ import pytest
 
 from terrain.estimation.models import sideslip
 from terrain.estimation.models.observer import ObserverStatus, observe
-from terrain.estimation.models.sideslip import FIRST_STD, RATE, ROWS, SETTINGS, Sideslip
+from terrain.estimation.models.sideslip import FIRST_STD, RATE, SETTINGS, Sideslip
 from terrain.robots import load_robot
-from terrain.simulation.plants.car import CAR_ROWS, CarCommand, CarDrive, level_ground
+from terrain.simulation.plants.car import CarCommand, CarDrive, level_ground
 from terrain.simulation.run import simulate
 
 ROBOT = load_robot("adap2e")
@@ -86,14 +86,12 @@ def plain(rows, s):
                 [(BEHIND * front - AHEAD * rear) / ROBOT.yaw_inertia_kgm2, (front + rear) / ROBOT.mass_kg]
             )
 
-        def motion(
-            x, u=u, steer=steer, roll=roll, dynamic=dynamic, u_before=u_before, steer_before=steer_before
-        ):
+        def motion(x, u=u, steer=steer, roll=roll, dynamic=dynamic, before=(u_before, steer_before)):
             if not dynamic:
-                slip = np.arctan([x[4] + BEHIND / L * x[3], x[4] - AHEAD / L * x[3]]) - [steer_before, 0.0]
+                slip = np.arctan([x[4] + BEHIND / L * x[3], x[4] - AHEAD / L * x[3]]) - [before[1], 0.0]
                 turn = np.tan(steer + slip[0]) - np.tan(slip[1])
                 return np.array([turn, np.tan(slip[1]) + AHEAD / L * turn])
-            v = np.array([u_before / L, u_before]) * x[3:5]
+            v = before[0] * np.array([1.0 / L, 1.0]) * x[3:5]
             f = lambda v: forces(*v, x[5:]) - [0.0, u * v[0] + G * np.sin(roll)]  # noqa: E731
             v = v + np.linalg.solve(np.eye(2) - TICK_S * derivative(f, v), TICK_S * f(v))
             return v / np.array([u / L, u])
@@ -153,9 +151,9 @@ def plain(rows, s):
 
 @ANY
 def test_it_is_the_filter_in_plain_numpy(name):
-    time_s, rows, _ = drive(4.0, seed=3, roll_rad=0.1, seconds=8.0)
+    time_s, rows, _ = drive(4.0, seed=3, roll_rad=0.1, seconds=6.0)
     track, expected = observed(name, time_s, rows), plain(rows, SETTINGS[name])
-    moves = slice(250, None)  # where it began is forgotten
+    moves = slice(200, None)  # where it began is forgotten
     assert track.slip[moves] == pytest.approx(expected[moves, :2], abs=1e-5)
     if SETTINGS[name].by_dynamics:
         assert track.state("cornering_front_npr")[moves] == pytest.approx(
@@ -164,14 +162,10 @@ def test_it_is_the_filter_in_plain_numpy(name):
         assert track.std[moves, 4] == pytest.approx(rows[moves, 0] * expected[moves, 3], rel=1e-3)
 
 
-def test_rows_are_those_of_the_simulated_car():
-    assert ROWS == CAR_ROWS
-
-
 @ANY
 @pytest.mark.parametrize("roll_rad", [0.0, 0.2])
 def test_slip_comes_back_within_its_own_error(name, roll_rad):
-    time_s, rows, truth = drive(4.0, seed=1, roll_rad=roll_rad)
+    time_s, rows, truth = drive(4.0, seed=1, roll_rad=roll_rad, seconds=20.0)
     track = observed(name, time_s, rows)
     error = (track.slip - true_slips(truth))[time_s > 5.0]
     assert np.isfinite(error).all()
@@ -179,7 +173,7 @@ def test_slip_comes_back_within_its_own_error(name, roll_rad):
     assert 0.4 < np.sqrt(((error / track.slip_std[time_s > 5.0]) ** 2).mean()) < 1.4
 
 
-@pytest.mark.parametrize(("speed_mps", "seed", "roll_rad"), [(4.0, 4, 0.0), (5.0, 5, 0.0), (5.0, 2, 0.2)])
+@pytest.mark.parametrize(("speed_mps", "seed", "roll_rad"), [(4.0, 4, 0.0), (5.0, 2, 0.2)])
 def test_stiffness_is_the_secant_of_the_force(speed_mps, seed, roll_rad):
     time_s, rows, truth = drive(speed_mps, seed=seed, roll_rad=roll_rad)
     stiffness, slips = observed("sideslip-multi", time_s, rows).mean[:, 5:7], true_slips(truth)
@@ -207,18 +201,25 @@ def test_the_dynamic_observer_needs_neither_positions_nor_headings():
 
 
 @ANY
-def test_at_rest_everything_is_as_it_was(name):
-    time_s, rows, truth = drive(3.0, seed=7, stops=((20.0, 4.0),))
+def test_at_rest_everything_is_as_it_was_and_reversing_has_the_slip_of_its_own_direction(name):
+    time_s, rows, truth = drive(3.0, seed=7, stops=((10.0, 4.0),), seconds=18.0)
     track = observed(name, time_s, rows)
     stands = (truth("speed_x_mps") == 0.0) & (time_s > 2.0) & (np.abs(rows[:, 0]) < 0.05)
     assert stands.sum() > 150
     assert (track.status[stands] == ObserverStatus.STANDING).all()
     first = np.flatnonzero(stands)[0]
-    quiet = slice(first, first + 100)
-    if stands[quiet].all():
-        assert np.ptp(track.slip[quiet], axis=0).max() == 0.0
-        assert np.ptp(track.mean[quiet], axis=0).max() == 0.0
+    assert stands[first : first + 100].all()
+    for kept in (track.slip, track.mean):
+        assert np.ptp(kept[first : first + 100], axis=0).max() == 0.0
     assert np.nanmax(np.abs(track.slip)) < np.radians(4.0)
+    # backward along a slope: a side force opposes the same lateral speed as forward
+    time_s, roll_rad = np.arange(400) * TICK_S, -0.1
+    expected = -ROBOT.mass_kg * G * np.sin(roll_rad) / C_0.sum()
+    rows = np.full((400, 8), np.nan)
+    rows[:, :2], rows[:, 4:7] = (-2.0, 0.0), (0.0, 0.0, roll_rad)
+    rows[:, 2], rows[:, 3] = -2.0 * time_s, 2.0 * expected * time_s
+    rows[:, 7] = G * np.sin(roll_rad)
+    assert observed(name, time_s, rows).slip[-1] == pytest.approx(expected, rel=0.2)
 
 
 def test_without_a_gyro_slip_follows_the_pose_and_stiffness_stays():
@@ -233,15 +234,3 @@ def test_without_a_gyro_slip_follows_the_pose_and_stiffness_stays():
     track = observed("sideslip-multi", time_s, faulty)
     assert np.abs(track.slip - true_slips(truth))[time_s > 4.0].max() < np.radians(5.0)
     assert np.abs(track.mean[:, 3] - truth("yaw_rate_radps"))[time_s > 16.5].max() < 0.05
-
-
-@ANY
-def test_reversing_has_the_slip_of_its_own_direction(name):
-    """Backward along a slope: a side force opposes the same lateral speed as forward."""
-    time_s, roll_rad = np.arange(400) * TICK_S, -0.1
-    expected = -ROBOT.mass_kg * G * np.sin(roll_rad) / C_0.sum()
-    rows = np.full((400, 8), np.nan)
-    rows[:, :2], rows[:, 4:7] = (-2.0, 0.0), (0.0, 0.0, roll_rad)
-    rows[:, 2], rows[:, 3] = -2.0 * time_s, 2.0 * expected * time_s
-    rows[:, 7] = G * np.sin(roll_rad)
-    assert observed(name, time_s, rows).slip[-1] == pytest.approx(expected, rel=0.2)
