@@ -1,3 +1,5 @@
+"""Rows of measurements by whole logs: ideal sensors give the motion; faults; gyro and rest of robots that skid."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -5,7 +7,17 @@ import pytest
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.feed import CAMERA_ROWS, GNSS_ROWS, REST_ROW, ROWS_OF_DRIVE, measurement_table
+from terrain.estimation.feed import (
+    CAMERA_ROWS,
+    GNSS_ROWS,
+    REST_ROW,
+    REST_S,
+    ROWS_OF_DRIVE,
+    STEADY_RADPS,
+    measurement_table,
+    new_feed,
+    rest_at,
+)
 from terrain.kinematics.camera import odometry_stream
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
 from terrain.records import RunLog, Stream
@@ -123,9 +135,6 @@ def test_smoothing_of_the_thesis_is_there_to_be_compared():
     np.testing.assert_array_equal(smooth.columns(others), raw.columns(others))
 
 
-# faults
-
-
 def test_samples_that_are_no_numbers_are_left_out_and_counted():
     run = change(RUN, "imu", set_rows([10, 11, 200], np.inf, "gyro_z_radps"))
     run = change(run, "odometry", set_rows(lambda t: (t > 2) & (t < 3), np.nan))
@@ -140,22 +149,18 @@ def test_samples_that_are_no_numbers_are_left_out_and_counted():
     assert np.isnan(table.columns(CAMERA_ROWS)[(table.time_s > 2.03) & (table.time_s < 2.99)]).all()
 
 
-@pytest.mark.parametrize(
-    ("start_s", "end_s", "value", "channel", "dropped"),
-    [
+def test_a_camera_without_rotation_or_confidence_is_left_out_and_counted():
+    for start_s, end_s, value, channel, dropped in (
         (4.0, 6.0, 0.0, "quaternion_w_ratio", {"odometry: no rotation": 20}),  # then the channel is frozen
         (2.0, 3.0, 1 / 3, "confidence_ratio", {"odometry: low confidence": 200}),
-    ],
-)
-def test_a_camera_without_rotation_or_confidence_is_left_out_and_counted(
-    start_s, end_s, value, channel, dropped
-):
-    run = change(RUN, "odometry", set_rows(lambda t: (t >= start_s) & (t < end_s), value, channel))
-    table = measurement_table(run, bare())
-    assert table.dropped == dropped
-    assert np.isnan(
-        table.columns(CAMERA_ROWS)[(table.time_s > start_s + 0.03) & (table.time_s < end_s)]
-    ).all()
+    ):
+        run = change(
+            RUN, "odometry", set_rows(lambda t, a=start_s, b=end_s: (t >= a) & (t < b), value, channel)
+        )
+        table = measurement_table(run, bare())
+        assert table.dropped == dropped
+        lost = (table.time_s > start_s + 0.03) & (table.time_s < end_s)
+        assert np.isnan(table.columns(CAMERA_ROWS)[lost]).all()
 
 
 def test_stamps_that_do_not_increase_cost_their_sample_only_and_a_clock_set_back_its_shorter_part():
@@ -184,37 +189,6 @@ def test_stamps_that_do_not_increase_cost_their_sample_only_and_a_clock_set_back
     assert table.time_s[-1] == pytest.approx(3.98)
 
 
-# robots that skid, bad input
-
-
-def husky_run(*, gnss=False):
-    rng = np.random.default_rng(0)
-    t = np.arange(100) / 10
-    streams = {
-        "wheels": Stream(t, np.column_stack([t, 2 * t]), ("speed_left_mps", "speed_right_mps")),
-        "imu": Stream(
-            np.arange(1000) / 100,
-            0.3 + NOISE * rng.standard_normal((1000, 3)),
-            [f"gyro_{axis}_radps" for axis in "xyz"],
-        ),
-    }
-    if gnss:
-        streams["gnss"] = Stream(t[::2], np.column_stack([t, t])[::2], ("position_x_m", "position_y_m"))
-    return RunLog("skid", "husky", streams)
-
-
-def test_a_skid_steered_robot_has_sides_and_a_gyro():
-    table = measurement_table(husky_run(), HUSKY)
-    assert table.rows == ("wheel_left_mps", "wheel_right_mps", "gyro_z_radps", *GNSS_ROWS, REST_ROW)
-    np.testing.assert_allclose(table.z[:, :2], np.column_stack([table.time_s, 2 * table.time_s]))
-    np.testing.assert_allclose(table.z[:, 2], 0.3, atol=6 * NOISE)
-    assert np.isnan(table.z[:, 3:]).all()
-    with_gnss = measurement_table(husky_run(gnss=True), HUSKY, gnss_latency_s=0.0)
-    np.testing.assert_allclose(with_gnss.z[::2, 3], with_gnss.time_s[::2])
-    assert np.isnan(with_gnss.z[:, 5:]).all()  # no speed in this stream
-    np.testing.assert_allclose(with_gnss.gnss_variance[::2, 0], 0.25)  # no fix was reported
-
-
 def test_logs_without_a_clock_are_refused():
     empty = change(RUN, "wheels", lambda t, v, c: (t[:0], v[:0]))
     with pytest.raises(DataError, match="run run: there is no stream 'wheels', which gives the clock"):
@@ -223,18 +197,99 @@ def test_logs_without_a_clock_are_refused():
         measurement_table(empty, ROBOT)
     with pytest.raises(DataError, match="no channel 'speed_left_mps', which the robot husky should have"):
         measurement_table(RUN, HUSKY)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+    for options, message in (
         ({"time_constant_s": -0.1}, "time_constant_s is -0.1"),
         ({"time_constant_s": np.nan}, "time_constant_s is nan"),
         ({"ema_alpha": 1.0}, "ema_alpha is 1, a number from 0 to below 1"),
         ({"ema_alpha": 0.2, "time_constant_s": 0.1}, "not both"),
         ({"gnss_latency_s": -1.0}, "gnss_latency_s is -1"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            measurement_table(RUN, ROBOT, **options)
+
+
+# -- robots that skid: the gyro's mean between ticks, and what only looks like rest ---------------------------------
+
+GYRO_S, WHEELS_S = np.arange(0.0, 40.0, 0.01), np.arange(0.0, 39.9, 2 / 13)
+STILL = np.random.default_rng(7).normal(0.0, 0.002, GYRO_S.size)
+
+
+def skid_run(gyro_radps, speed_mps=0.0, gnss=None):
+    """Return a run by a gyro about z, and speeds of the wheels: one, or those of both sides (2, n)."""
+    wheels = np.broadcast_to(speed_mps, (2, WHEELS_S.size)).T
+    axes = np.column_stack([STILL, -STILL, gyro_radps])
+    streams = {
+        "wheels": Stream(WHEELS_S, wheels, ("speed_left_mps", "speed_right_mps")),
+        "imu": Stream(GYRO_S, axes, [f"gyro_{axis}_radps" for axis in "xyz"]),
+    }
+    return RunLog("drive", "husky", streams | ({} if gnss is None else {"gnss": gnss}))
+
+
+def rows_of(run):
+    table = measurement_table(run, HUSKY)
+    return table.time_s, *table.columns(["gyro_z_radps", REST_ROW]).T
+
+
+def test_a_skid_steered_robot_has_sides_and_a_gyro():
+    run = skid_run(0.3 + STILL, np.array([WHEELS_S, 2 * WHEELS_S]))
+    table = measurement_table(run, HUSKY)
+    assert table.rows == ("wheel_left_mps", "wheel_right_mps", "gyro_z_radps", *GNSS_ROWS, REST_ROW)
+    np.testing.assert_allclose(table.z[:, :2], np.column_stack([table.time_s, 2 * table.time_s]))
+    np.testing.assert_allclose(table.z[:, 2], 0.3, atol=6 * 0.002)
+    assert np.isnan(table.z[:, 3:]).all()
+    fixes = Stream(WHEELS_S[::2], np.column_stack([WHEELS_S] * 2)[::2], ("position_x_m", "position_y_m"))
+    table = measurement_table(skid_run(STILL, 1.0, fixes), HUSKY, gnss_latency_s=0.0)
+    np.testing.assert_allclose(table.z[::2, 3], table.time_s[::2])
+    assert np.isnan(table.z[:, 5:]).all()  # no speed in this stream
+    np.testing.assert_allclose(table.gnss_variance[::2, 0], 0.25)  # no fix was reported
+
+
+def test_the_gyro_row_is_the_mean_since_the_last_tick():
+    gyro = np.sin(GYRO_S) + 0.2 * np.cos(2 * np.pi * 6.5 * GYRO_S) + STILL
+    time_s, mean, _ = rows_of(skid_run(gyro, 0.5))
+    angle = np.append(0.0, np.cumsum(0.5 * (gyro[1:] + gyro[:-1]) * np.diff(GYRO_S)))
+    last = np.searchsorted(GYRO_S, time_s + 1e-9) - 1
+    plain = np.diff(angle[last]) / np.diff(GYRO_S[last])
+    np.testing.assert_allclose(mean[1:], plain, atol=1e-12)
+    heading = np.sum(mean[1:] * np.diff(GYRO_S[last]))
+    assert heading == pytest.approx(angle[last[-1]], abs=1e-9)
+    sampled = np.sum(gyro[last][1:] * np.diff(time_s))  # what one sample a tick would make of it
+    assert abs(sampled - heading) > 1.0
+
+
+def test_rest_gives_the_mean_of_each_second():
+    bias_radps = 0.03
+    _, _, rest = rows_of(skid_run(bias_radps + STILL))
+    known = rest[np.isfinite(rest)]
+    assert known.size == pytest.approx(WHEELS_S[-1] / REST_S, rel=0.1)
+    np.testing.assert_allclose(known, bias_radps, atol=6 * 0.002 / np.sqrt(90))
+
+
+@pytest.mark.parametrize(
+    ("gyro_radps", "speed_mps"),
+    [
+        (STILL, 0.05),
+        (STILL, -0.05),
+        (STILL, np.nan),
+        (0.5 + STILL, 0.0),
+        (STILL + 2 * STEADY_RADPS * np.sign(np.sin(3 * GYRO_S)), 0.0),
+        (np.where(np.arange(GYRO_S.size) % 90 < 60, np.nan, STILL), 0.0),
     ],
+    ids=["forward", "backward", "no wheels", "towed in a turn", "shaken", "no gyro"],
 )
-def test_invalid_options_are_refused(options, message):
-    with pytest.raises(ConfigError, match=message):
-        measurement_table(RUN, ROBOT, **options)
+def test_what_is_no_rest_gives_nothing(gyro_radps, speed_mps):
+    assert np.isnan(rows_of(skid_run(gyro_radps, speed_mps))[2]).all()
+
+
+def test_a_turn_that_begins_in_a_second_of_rest_is_no_part_of_the_row():
+    gyro = STILL + 0.5 * np.clip(GYRO_S - 10.0, 0.0, 1.0)
+    time_s, _, rest = rows_of(skid_run(gyro))
+    assert np.nanmax(np.abs(rest)) < 0.002
+    assert np.isnan(rest[(time_s > 10.3) & (time_s < 30.0)]).all()
+
+
+def test_a_clock_that_is_set_back_starts_anew():
+    feed = new_feed()[0]
+    rows = [rest_at(time_s, 0.0, 0.0, 0.01, feed) for time_s in (5.0, 5.5, 2.0, 2.5, 3.0)]
+    assert np.isnan(rows[:-1]).all()
+    assert rows[-1] == 0.01
