@@ -55,17 +55,22 @@ TURNTABLE = FilterModel(
 )
 
 
-def turned(seed=0, n=4000):
-    return sample_from_model(TURNTABLE, n, DT_S, np.random.default_rng(seed))
+@cache
+def drawn(n=4000):
+    return sample_from_model(TURNTABLE, n, DT_S, np.random.default_rng(0))
+
+
+def turned(n=4000):
+    """Return stamps, truth and measurements of the turntable's own equations, for the caller to change."""
+    return tuple(each.copy() for each in drawn(n))
 
 
 def verdicts(entries):
     return {entry.name: entry.verdict for entry in entries}
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_a_filter_on_its_own_equations_is_consistent(seed):
-    time_s, truth, z = turned(seed)
+def test_a_filter_on_its_own_equations_is_consistent():
+    time_s, truth, z = turned()
     report = consistency_report(run_filter(TURNTABLE, time_s, z), truth)
     assert verdicts(report["sensors"]) == {"compass": "consistent", "gyro": "consistent"}
     assert set(verdicts(report["states"])) == {"yaw", "yaw_rate", "gyro_bias", "all"}
@@ -88,16 +93,12 @@ def test_noise_that_is_off_is_found_where_it_is(factor, verdict):
 
 
 def test_a_filter_that_leaves_out_what_does_not_fit_is_not_called_consistent():
-    time_s, _, z = turned()
+    time_s, truth, z = turned()
     z[np.random.default_rng(0).random(len(z)) < 0.05, 1] += 5.0
     (compass, gyro) = consistency_report(run_filter(TURNTABLE, time_s, z))["sensors"]
     assert gyro.gated_fraction == pytest.approx(0.05, abs=0.015)
     assert (compass.verdict, gyro.verdict) == ("consistent", "overconfident")
-
-
-def test_a_sensor_without_measurements_has_an_unknown_verdict():
-    time_s, truth, z = turned(n=200)
-    z[:, 0] = np.nan
+    z[:, 0] = np.nan  # and of a sensor without measurements the verdict is unknown
     truth[:, 2] = np.nan
     report = consistency_report(run_filter(TURNTABLE, time_s, z), truth)
     assert report["sensors"][0].verdict == "unknown"
@@ -125,42 +126,29 @@ def test_nees_is_the_squared_error_over_its_covariance_with_angles_wrapped():
 ROBOT = load_robot("agrimaro")
 
 
-@cache
-def filtered():
+def test_innovations_scaled_have_unit_variance_and_no_memory_and_are_none_after_a_gap():
     model = make_filter("vio15", ROBOT)
-    time_s, _, drawn = sample_from_model(model, 1500, 0.02, np.random.default_rng(0))
-    z = np.array(drawn)
+    time_s, _, z = sample_from_model(model, 1500, 0.02, np.random.default_rng(0))
     z[200:250, model.rows.index("camera_speed_x_mps")] = np.nan
     track = run_filter(model, time_s, z, FilterSettings(gate_probability=1.0))
-    return model, track, innovations(model, track, z)
-
-
-def test_scaled_innovations_have_unit_variance_and_no_memory():
-    _, _, found = filtered()
-    scaled = np.column_stack([value / std for value, std in found.values()])[50:]
+    found = innovations(model, track, z)
     assert np.isnan([value[0] for value, _ in found.values()]).all()
-    for column in scaled.T:
-        column = column[np.isfinite(column)]
-        assert abs(column.var() - 1.0) < 5 * np.sqrt(2 / column.size)
-        assert abs(np.mean(column[1:] * column[:-1])) < 5 / np.sqrt(column.size)
-
-
-def test_the_first_sensor_of_a_step_has_the_square_that_the_filter_kept():
-    model, track, found = filtered()
-    _, rows = model.sensors[0]  # conditioned on first: its prediction is that of the step
-    assert len(rows) == 1
-    value, std = found[rows[0]]
+    for value, std in found.values():
+        scaled = (value / std)[50:]
+        scaled = scaled[np.isfinite(scaled)]
+        assert abs(scaled.var() - 1.0) < 5 * np.sqrt(2 / scaled.size)
+        assert abs(np.mean(scaled[1:] * scaled[:-1])) < 5 / np.sqrt(scaled.size)
+    # the first sensor of a step, conditioned on before the others, has the square that the filter kept
+    (row,) = model.sensors[0][1]
+    value, std = found[row]
     np.testing.assert_allclose((value / std)[1:] ** 2, track.nis[1:, 0], rtol=1e-6, atol=1e-9)
 
-
-def test_the_first_row_after_a_gap_has_no_innovation():
-    model = make_filter("vio15", ROBOT)
-    time_s, _, z = sample_from_model(model, 400, 0.02, np.random.default_rng(1))
-    time_s = np.where(np.arange(400) < 200, time_s, time_s + 6.0)
+    time_s, z = np.where(np.arange(400) < 200, time_s[:400], time_s[:400] + 6.0), z[:400]
     track = run_filter(model, time_s, z)
     found = innovations(model, track, z[np.searchsorted(time_s, track.time_s)])
     after = int(np.flatnonzero(np.diff(track.time_s) > 1.0)[0]) + 1
-    for value, std in found.values():
+    for row in ("gyro_z_radps", "wheel_1_radps"):
+        value, std = found[row]
         assert np.isnan([value[after], std[after]]).all()
         assert np.isfinite(value[after + 1 :]).all()
 
@@ -168,30 +156,14 @@ def test_the_first_row_after_a_gap_has_no_innovation():
 STATES = ("yaw_rad", "speed_x_mps", "steer_2_rad", "gyro_bias_radps", "slip_speed_3_mps", "effective_track_m")
 
 
-@pytest.fixture(scope="module")
-def run():
-    return simulate_run(ROBOT, "grass", "arc", 0, duration_s=10.0)
-
-
 def empty_track(states, time_s):
-    n, d = len(time_s), len(states)
-    none = np.zeros((n, 1))
-    return StateTrack(
-        time_s,
-        np.zeros((n, d)),
-        np.tile(np.eye(d), (n, 1, 1)),
-        states,
-        none,
-        none,
-        none,
-        ("s",),
-        np.zeros(n),
-        0.0,
-    )
+    (n, d), none = (len(time_s), len(states)), np.zeros((len(time_s), 1))
+    cov = np.tile(np.eye(d), (n, 1, 1))
+    return StateTrack(time_s, np.zeros((n, d)), cov, states, none, none, none, ("s",), np.zeros(n), 0.0)
 
 
-def test_truth_passes_the_low_pass_of_the_filter_inputs(run):
-    time_s = np.arange(0.5, 9.0, 0.02)
+def test_truth_passes_the_low_pass_of_the_filter_inputs_and_is_none_without_one():
+    run, time_s = simulate_run(ROBOT, "grass", "arc", 0, duration_s=10.0), np.arange(0.5, 9.0, 0.02)
     truth = run.streams["truth"]
     found = true_states(run, empty_track(STATES, time_s), ROBOT, 0.05)
     speed = low_passed(truth.time_s, truth.channel("speed_x_mps"), 0.05, 1.0)
@@ -202,9 +174,6 @@ def test_truth_passes_the_low_pass_of_the_filter_inputs(run):
     assert lag_s == pytest.approx(0.05, abs=0.01)
     assert found[0, 0] == pytest.approx(0.0, abs=0.02)
     assert np.isnan(found[:, 5]).all()  # there is no true effective track
-
-
-def test_a_run_without_truth_gives_none_and_an_extra_wheel_is_refused(run):
     streams = {name: stream for name, stream in run.streams.items() if name != "truth"}
     track = empty_track(("speed_x_mps",), np.arange(0.0, 1.0, 0.1))
     assert true_states(RunLog("a", "agrimaro", streams), track, ROBOT, 0.05) is None
