@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError
-from terrain.estimation.estimate import FILTERS, estimate_run, summarize
+from terrain.estimation.estimate import estimate_run, summarize
 from terrain.records import Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
@@ -17,8 +17,8 @@ ROBOT = load_robot("agrimaro")
 LOST = Faults(camera_lost_s=((10.0, 13.0),), by_chance=False)
 
 
-def drive(scenario="straight", terrain="grass", seed=0, **options):
-    return simulate_run(ROBOT, terrain, scenario, seed, **options)
+def drive(scenario="straight", seed=0, **options):
+    return simulate_run(ROBOT, "grass", scenario, seed, **options)
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +26,7 @@ def straight():
     return drive()
 
 
-@pytest.mark.parametrize("scenario", ["straight", "arc"])
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(("scenario", "seed"), [("straight", 0), ("arc", 1)])
 def test_slip_of_12_5_percent_is_found_by_15_states_and_read_low_by_the_thesis_own(scenario, seed):
     run = drive(scenario, seed=seed)
     row = summarize(estimate_run(run, ROBOT, "vio15"))
@@ -60,17 +59,15 @@ def turned(run, angle_rad):
     return replace(run, streams={**run.streams, "gnss": Stream(gnss.time_s, values, gnss.channels)})
 
 
-@pytest.mark.parametrize("angle_rad", [0.0, 1.5, -2.9])
+@pytest.mark.parametrize("angle_rad", [0.0, -2.9])
 def test_the_heading_of_the_start_is_found_from_the_drive(angle_rad):
     run = turned(drive("arc", gnss=Gnss()), angle_rad)
-    for name in ("vio15", "encoder12"):
+    for name in ("encoder12", "vio15"):
         found = estimate_run(run, ROBOT, name)
-        start = found.table.columns(["imu_yaw_rad"])[10, 0]
+        start, row = found.table.columns(["imu_yaw_rad"])[10, 0], summarize(found)
         assert abs(np.angle(np.exp(1j * (start - angle_rad)))) < 0.03
-        assert summarize(found).slip_observable
-    assert summarize(estimate_run(run, ROBOT, "vio15")).slip_mean == pytest.approx(
-        summarize(estimate_run(run, ROBOT, "vio15")).slip_true_mean, abs=0.002
-    )
+        assert row.slip_observable
+    assert row.slip_mean == pytest.approx(row.slip_true_mean, abs=0.002)
 
 
 def test_a_receiver_that_never_moved_is_left_out_and_counted():
@@ -79,7 +76,7 @@ def test_a_receiver_that_never_moved_is_left_out_and_counted():
     assert "gnss_position" not in found.track.sensors
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_camera_outage_of_3_s_makes_slip_stale_and_less_certain_but_close(seed):
     run = drive(seed=seed, faults=LOST)
     found = estimate_run(run, ROBOT, "vio15")
@@ -102,23 +99,12 @@ def test_a_camera_outage_of_3_s_makes_slip_stale_and_less_certain_but_close(seed
     assert abs(thesis.blind.slip_ratio[lost][-20:].mean()) < 0.02
 
 
-def spoilt(run, stream, change):
-    streams = dict(run.streams)
-    old = streams[stream]
-    time_s, values = change(old.time_s.copy(), old.values.copy())
-    streams[stream] = Stream(time_s, values, old.channels)
-    return replace(run, streams=streams)
-
-
 @pytest.mark.parametrize(("stream", "channel"), [("wheels", "motor_1_radps"), ("steering", "angle_1_rad")])
 def test_a_wheel_without_samples_has_no_slip(straight, stream, channel):
-    column = straight.streams[stream].channels.index(channel)
-
-    def silent(time_s, values):
-        values[time_s > 10.0, column] = np.nan
-        return time_s, values
-
-    slip = estimate_run(spoilt(straight, stream, silent), ROBOT, "vio15").slip
+    sound, values = straight.streams[stream], straight.streams[stream].values.copy()
+    values[sound.time_s > 10.0, sound.channels.index(channel)] = np.nan
+    silent = Stream(sound.time_s, values, sound.channels)
+    slip = estimate_run(replace(straight, streams={**straight.streams, stream: silent}), ROBOT, "vio15").slip
     late = slip.time_s > 10.7
     assert np.isnan(slip.slip_ratio[late, 0]).all()
     assert np.isfinite(slip.slip_ratio[late, 1:]).all()
@@ -126,7 +112,6 @@ def test_a_wheel_without_samples_has_no_slip(straight, stream, channel):
 
 
 def test_unknown_filters_and_tunings_are_refused_in_one_sentence(straight):
-    assert set(FILTERS) == {"encoder12", "vio12", "vio15", "skid"}
     with pytest.raises(ConfigError, match="'skid' is not for robot agrimaro"):
         estimate_run(straight, ROBOT, "skid")
     with pytest.raises(ConfigError, match="no tuning 'best'"):
