@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from model_draws import sample_from_model
+from model_draws import CARRIAGE, sample_from_model
 
 from terrain.errors import DataError
 from terrain.estimation.consistency import (
@@ -14,55 +14,22 @@ from terrain.estimation.consistency import (
     nees,
     true_states,
 )
-from terrain.estimation.filter import FilterModel, FilterSettings, run_filter
+from terrain.estimation.filter import FilterSettings, run_filter
 from terrain.estimation.models.swerve import make_filter
-from terrain.kernels import njit
 from terrain.records import RunLog, StateTrack, Stream
 from terrain.robots import load_robot
 from terrain.signals import low_passed
 from terrain.simulation.run import simulate_run
 
-DT_S = 0.05
-
-
-@njit
-def turn(x, dt, params, x_next, f):
-    x_next[:] = x
-    x_next[0] += dt * x[1]
-    f[0, 0], f[0, 1], f[1, 1], f[2, 2] = 1.0, dt, 1.0, 1.0
-
-
-@njit
-def read(x, params, z_hat, h):
-    z_hat[0], z_hat[1] = x[0], x[1] + x[2]
-    h[0, 0], h[1, 1], h[1, 2] = 1.0, 1.0, 1.0
-
-
-WALK, SAMPLE = np.square([1e-3, 0.3, 0.01]), np.square([0.03, 0.02])
-TURNTABLE = FilterModel(
-    name="turntable",
-    states=("yaw_rad", "yaw_rate_radps", "gyro_bias_radps"),
-    rows=("compass_rad", "gyro_z_radps"),
-    sensors=(("compass", ("compass_rad",)), ("gyro", ("gyro_z_radps",))),
-    propagate=turn,
-    observe=read,
-    params=np.zeros(1),
-    process_variance=WALK,
-    measurement_variance=SAMPLE,
-    initial_variance=np.square([1.0, 1.0, 0.1]),
-    angle_states=("yaw_rad",),
-    angle_rows=("compass_rad",),
-)
-
 
 @cache
-def drawn(n=4000):
-    return sample_from_model(TURNTABLE, n, DT_S, np.random.default_rng(0))
+def drawn():
+    return sample_from_model(CARRIAGE, 4000, 0.05, np.random.default_rng(0))
 
 
-def turned(n=4000):
-    """Return stamps, truth and measurements of the turntable's own equations, for the caller to change."""
-    return tuple(each.copy() for each in drawn(n))
+def ridden():
+    """Return stamps, truth and measurements of the carriage's own equations, for the caller to change."""
+    return tuple(each.copy() for each in drawn())
 
 
 def verdicts(entries):
@@ -70,41 +37,45 @@ def verdicts(entries):
 
 
 def test_a_filter_on_its_own_equations_is_consistent():
-    time_s, truth, z = turned()
-    report = consistency_report(run_filter(TURNTABLE, time_s, z), truth)
-    assert verdicts(report["sensors"]) == {"compass": "consistent", "gyro": "consistent"}
-    assert set(verdicts(report["states"])) == {"yaw", "yaw_rate", "gyro_bias", "all"}
-    assert list(verdicts(report["states"]).values()).count("consistent") >= 3  # four bounds of 95 %
+    time_s, truth, z = ridden()
+    report = consistency_report(run_filter(CARRIAGE, time_s, z), truth)
+    assert verdicts(report["sensors"]) == {"place": "consistent", "rate": "consistent"}
+    assert set(verdicts(report["states"])) == {"position", "speed", "all"}
+    assert list(verdicts(report["states"]).values()).count("consistent") >= 2  # three bounds of 95 %
     for entry in report["sensors"]:
         assert entry.n_independent > 0.8 * entry.n  # innovations are white
-    assert {e.name: e for e in report["states"]}["yaw"].n_independent < 0.8 * 4000  # errors are not
+    assert {e.name: e for e in report["states"]}["position"].n_independent < 0.8 * 4000  # errors are not
 
 
 @pytest.mark.parametrize(("factor", "verdict"), [(1 / 3, "overconfident"), (3.0, "conservative")])
 def test_noise_that_is_off_is_found_where_it_is(factor, verdict):
-    time_s, truth, z = turned()
-    off = replace(TURNTABLE, measurement_variance=SAMPLE * [1.0, factor])
+    time_s, truth, z = ridden()
+    off = replace(CARRIAGE, measurement_variance=CARRIAGE.measurement_variance * [1.0, factor])
     report = consistency_report(run_filter(off, time_s, z), truth)
-    assert verdicts(report["sensors"])["gyro"] == verdict
-    wrong = replace(TURNTABLE, process_variance=WALK * factor, measurement_variance=SAMPLE * factor)
+    assert verdicts(report["sensors"])["rate"] == verdict
+    wrong = replace(
+        CARRIAGE,
+        process_variance=CARRIAGE.process_variance * factor,
+        measurement_variance=CARRIAGE.measurement_variance * factor,
+    )
     report = consistency_report(run_filter(wrong, time_s, z), truth)
-    assert verdicts(report["sensors"]) == {"compass": verdict, "gyro": verdict}
+    assert verdicts(report["sensors"]) == {"place": verdict, "rate": verdict}
     assert verdicts(report["states"])["all"] == verdict
 
 
 def test_a_filter_that_leaves_out_what_does_not_fit_is_not_called_consistent():
-    time_s, truth, z = turned()
+    time_s, truth, z = ridden()
     z[np.random.default_rng(0).random(len(z)) < 0.05, 1] += 5.0
-    (compass, gyro) = consistency_report(run_filter(TURNTABLE, time_s, z))["sensors"]
-    assert gyro.gated_fraction == pytest.approx(0.05, abs=0.015)
-    assert (compass.verdict, gyro.verdict) == ("consistent", "overconfident")
+    (place, rate) = consistency_report(run_filter(CARRIAGE, time_s, z))["sensors"]
+    assert rate.gated_fraction == pytest.approx(0.05, abs=0.015)
+    assert (place.verdict, rate.verdict) == ("consistent", "overconfident")
     z[:, 0] = np.nan  # and of a sensor without measurements the verdict is unknown
-    truth[:, 2] = np.nan
-    report = consistency_report(run_filter(TURNTABLE, time_s, z), truth)
+    truth[:, 1] = np.nan
+    report = consistency_report(run_filter(CARRIAGE, time_s, z), truth)
     assert report["sensors"][0].verdict == "unknown"
     assert report["sensors"][0].n == 0
     assert np.isnan(report["sensors"][0].mean_per_dof)
-    assert set(verdicts(report["states"])) == {"yaw", "yaw_rate", "all"}
+    assert set(verdicts(report["states"])) == {"position"}
 
 
 def test_nees_is_the_squared_error_over_its_covariance_with_angles_wrapped():

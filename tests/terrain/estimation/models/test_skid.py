@@ -58,7 +58,7 @@ def test_the_hidden_track_and_bias_come_back_from_a_drive_with_turns(hidden_m):
     assert sum(track.dropped.values()) < 0.02 * z.size
 
 
-@pytest.mark.parametrize("difference_mps", [0.5, -0.3, 2 * MIN_TURN_RADPS, 0.5 * MIN_TURN_RADPS])
+@pytest.mark.parametrize("difference_mps", [0.5, -0.3, 0.5 * MIN_TURN_RADPS])
 @pytest.mark.parametrize("turns_radps", [0.3, 0.01])
 def test_jacobians_are_those_of_finite_differences(difference_mps, turns_radps):
     """With the weight of the wheels as a constant, and without the track where wheels hardly differ."""

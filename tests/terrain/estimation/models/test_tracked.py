@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from terrain.angles import wrapped
 from terrain.estimation.models.observer import ObserverStatus, observe
 from terrain.estimation.models.tracked import (
     TrackedObserver,
@@ -35,24 +36,19 @@ def drive(speeds, eta, duration_s=60.0, rng=None, position_std_m=0.0, yaw_std_ra
     """
     n = round(duration_s * HZ) + 1
     speed, eta = (np.stack([np.broadcast_to(side, n) for side in pair], axis=-1) for pair in (speeds, eta))
-    ground = np.empty((n - 1, 2))
-    for j in range(2):
-        ground[:, j] = (speed[1:, j] + speed[:-1, j]) / 2 * (eta[1:, j] + eta[:-1, j]) / 2
+    ground = (speed[1:] + speed[:-1]) / 2 * (eta[1:] + eta[:-1]) / 2
     turn = (ground[:, 1] - ground[:, 0]) / (2 * D * HZ)
     yaw = np.r_[0.0, np.cumsum(turn)]
     chord = ground.mean(axis=1) / HZ * np.sinc(turn / (2 * np.pi))
-    middle = yaw[:-1] + turn / 2
-    pose = np.stack(
-        [np.r_[0.0, np.cumsum(chord * np.cos(middle))], np.r_[0.0, np.cumsum(chord * np.sin(middle))], yaw],
-        axis=-1,
-    )
+    place = np.r_[0.0, np.cumsum(chord * np.exp(1j * (yaw[:-1] + turn / 2)))]
+    pose = np.stack([place.real, place.imag, yaw], axis=-1)
     rows = np.full((n, 6), np.nan)
     rows[:, :2] = speed
     rows[::EVERY, 2:5] = pose[::EVERY]
     if rng is not None:
         noise = rng.standard_normal((len(rows[::EVERY]), 3))
         rows[::EVERY, 2:5] += noise * [position_std_m, position_std_m, yaw_std_rad]
-    rows[:, 4] = np.pi - np.remainder(np.pi - rows[:, 4], 2 * np.pi)  # as a compass shows it
+    rows[:, 4] = wrapped(rows[:, 4])  # as a compass shows it
     if gyro:
         rows[:, 5] = (eta[:, 1] * speed[:, 1] - eta[:, 0] * speed[:, 0]) / (2 * D)
     return np.arange(n) / HZ, rows, pose, eta
@@ -66,11 +62,6 @@ def track_of(time_s, rows, settings=PAPER):
     return observe(TrackedObserver(ROBOT, settings), time_s, rows)
 
 
-def settling_s(time_s, found, true, ratio):
-    """Return when both efficiencies stay within a ratio of the true ones."""
-    return time_s[np.flatnonzero((abs(found - true) > ratio * true).any(axis=1))[-1] + 1]
-
-
 def names(track):
     return [ObserverStatus(code).name for code in track.status]
 
@@ -82,7 +73,8 @@ def test_it_settles_with_the_gains_of_the_paper(drive_of, bars_s, gyro):
     track = track_of(time_s, rows)
     found = efficiencies(track)
     for ratio, bar_s in zip((0.05, 0.02), bars_s, strict=True):
-        assert settling_s(time_s, found, eta, ratio) <= bar_s
+        settles = np.flatnonzero((abs(found - eta) > ratio * eta).any(axis=1))[-1] + 1
+        assert time_s[settles] <= bar_s
     np.testing.assert_allclose(found[-1], eta[-1], atol=2e-4)
     # excitation is the smallest eigenvalue of M'M, forgotten with the time constant of (14)
     m = regressor(0.0, *drive_of[0])
@@ -104,7 +96,7 @@ def test_errors_are_as_large_as_stated(settings, drive_of):
             estimate = observer.step(row, 1 / HZ).mean
             if k > 25 * HZ and k % (2 * HZ) == 0:
                 off = np.r_[pose[k] - estimate[:3], eta[k] - estimate[5:7]]
-                off[2] = math.remainder(off[2], 2 * math.pi)
+                off[2] = wrapped(off[2])
                 squares.append(off @ np.linalg.solve(observer.cov, off) / 5)
     # 12 runs, each at least two independent errors of 5 numbers: 3 * sqrt(2 / 120)
     assert abs(np.mean(squares) - 1) < 0.39
@@ -118,7 +110,7 @@ def test_reversed_motion_and_spin_in_place(speeds, eta):
     np.testing.assert_allclose(
         track.slip[-1], slip_ratio(np.array(speeds), np.array(eta) * speeds), atol=2e-3
     )
-    assert abs(np.remainder(track.state("yaw_rad")[-1] - pose[-1, 2] + np.pi, 2 * np.pi) - np.pi) < 0.01
+    assert abs(wrapped(track.state("yaw_rad")[-1] - pose[-1, 2])) < 0.01
     assert names(track)[-1] == "OK"
 
 
