@@ -255,7 +255,7 @@ FAULTS = {
     ],
     "stamps": [stamp(4.0, None), stamp(6.0, -0.5), stamp(10.0, 1e6), stamp(12.0, np.nan, n=3)],
 }
-"""What befalls a stream, one after the other: values and gaps, the last of them frozen; stamps twice, back, far ahead
+"""Faults of a stream, one after the other: values and gaps, the last of them frozen; stamps twice, back, far ahead
 and no numbers."""
 
 SWERVE_STREAMS = ("wheels", "steering", "imu", "odometry")
