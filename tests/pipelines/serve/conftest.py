@@ -16,14 +16,14 @@ def model_folder(mower_model, tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def service(model_folder):
-    """A service that several tests of a file use; each has sessions of its own name."""
+    """A service that many tests use; each has sessions of its own name."""
     with running(model=str(model_folder)) as found:
         yield found
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def driving(model_folder):
     """A service without a model, which gives commands to robots of any channels."""
     limits = Limits()._replace(hello_s=1.0, too_slow_s=0.6)

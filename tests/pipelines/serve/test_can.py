@@ -1,6 +1,7 @@
 """Corrections are the controller's or zero: never stale, never not finite, whatever is received or fails."""
 
 import copy
+import itertools
 import math
 import os
 import signal
@@ -18,6 +19,7 @@ from hypothesis import strategies as st
 from pipelines.data.can_frames import SIGNALS, decode, encode, load_layout
 from pipelines.live.chain import CommandStatus
 from pipelines.live.pilot import LivePilot
+from pipelines.serve import can_bus
 from pipelines.serve.can_bus import Bridge, Link, open_bus
 from pipelines.serve.serve import Settings, run
 from terrain.control.robot_control import PERIOD_S, PilotSettings
@@ -36,7 +38,7 @@ ACTIVE, RESOLUTION_RADPS = BridgeState.ACTIVE, 0.0005
 
 @pytest.fixture(scope="module")
 def arc():
-    return simulate_run(ROBOT, "grass", "arc", 7, duration_s=10.0)
+    return simulate_run(ROBOT, "grass", "arc", 7, duration_s=8.0)
 
 
 @pytest.fixture(scope="module")
@@ -95,21 +97,16 @@ def ticks(bridge, frames, until_s, read_at=lambda frame: frame.timestamp):
     return rows
 
 
-def of(stream):
-    keys = {plan.message.frame_id for plan in LAYOUT.by_stream[stream]}
-    return lambda frame: frame.arbitration_id in keys
-
-
 def states(rows, start_s, end_s):
     return {state for tick_s, _, state in rows if start_s < tick_s < end_s}
 
 
-STALE_S = {"twist": 0.2, "wheels": 0.1, "steering": 0.2}
 STALE = {
-    "twist": BridgeState.STALE_TWIST,
-    "wheels": BridgeState.STALE_WHEELS,
-    "steering": BridgeState.STEERING,
+    "twist": (0.2, BridgeState.STALE_TWIST, BridgeState.NO_TWIST),
+    "wheels": (0.1, BridgeState.STALE_WHEELS, BridgeState.NO_WHEELS),
+    "steering": (0.2, BridgeState.STEERING, BridgeState.STEERING),
 }
+"""By stream, its longest age, and the states without it: where it was there, and where it never was."""
 
 
 @pytest.mark.parametrize(
@@ -130,7 +127,7 @@ def test_a_stream_that_ends_stops_corrections_in_time_and_one_that_returns_start
     ids, last, n_ended = [plan.message.frame_id for plan in LAYOUT.by_stream[stream]], {}, Counter()
 
     def ended(frame):
-        if not of(stream)(frame) or not 3.0 < frame.timestamp < 4.0:
+        if frame.arbitration_id not in ids or not 2.0 < frame.timestamp < 3.0:
             last[frame.arbitration_id] = frame
             return [frame]
         if how == "hung":
@@ -145,22 +142,17 @@ def test_a_stream_that_ends_stops_corrections_in_time_and_one_that_returns_start
             return [changed(frame, data=flipped if stream == "twist" else frame.data[:5])]
         return []
 
-    bridge = bridged()
-    rows = ticks(bridge, [sent for frame in frames for sent in ended(frame)], 5.0)
-    assert states(rows, 1.0, 3.0) == {ACTIVE}
-    assert states(rows, 3.0 + STALE_S[stream] + PERIOD_S, 4.0) == {STALE[stream]}
-    assert states(rows, 4.0 + 2 * PERIOD_S, 5.0) == {ACTIVE}
+    bridge, (stale_s, stale, never) = bridged(), STALE[stream]
+    rows = ticks(bridge, [sent for frame in frames for sent in ended(frame)], 4.0)
+    assert states(rows, 1.0, 2.0) == {ACTIVE}
+    assert states(rows, 2.0 + stale_s + PERIOD_S, 3.0) == {stale}
+    assert states(rows, 3.0 + 2 * PERIOD_S, 4.0) == {ACTIVE}
     active = np.array([added for _, added, each in rows if each == ACTIVE])
     np.testing.assert_allclose(active, -1.0, atol=0.001)
     dropped = bridge.receiver.dropped
     assert dropped[kind] > 40 if kind else not dropped
-
-
-def test_a_stream_that_never_came_is_named(frames):
-    never = STALE | {"twist": BridgeState.NO_TWIST, "wheels": BridgeState.NO_WHEELS}
-    for stream, state in never.items():
-        rows = ticks(bridged(), [frame for frame in frames if not of(stream)(frame)], 1.0)
-        assert states(rows, 0.05, 1.0) == {state}
+    without = [frame for frame in frames if frame.arbitration_id not in ids]
+    assert states(ticks(bridged(), without, 0.3), 0.05, 0.3) == {never}
 
 
 @pytest.mark.parametrize("offset_s", [1.7e9, -50.0])
@@ -168,14 +160,14 @@ def test_the_clock_of_the_bus_may_be_any_and_one_that_is_set_is_followed(frames,
     """An hour ahead and back, as a computer's is by the network: corrections are zero, then go on."""
 
     def stamped(frame):
-        jump_s = 3600.0 * (3.0 < frame.timestamp < 6.0)
+        jump_s = 3600.0 * (2.0 < frame.timestamp < 4.5)
         return changed(frame, timestamp=frame.timestamp + offset_s + jump_s)
 
     sent = [stamped(frame) for frame in frames]
     read = {id(new): frame.timestamp for new, frame in zip(sent, frames, strict=True)}
     bridge = bridged()
-    rows = ticks(bridge, sent, 10.0, read_at=lambda frame: read[id(frame)])
-    for start_s, end_s in ((0.05, 3.0), (4.2, 6.0), (7.2, 10.0)):
+    rows = ticks(bridge, sent, 7.0, read_at=lambda frame: read[id(frame)])
+    for start_s, end_s in ((0.05, 2.0), (3.2, 4.5), (5.7, 7.0)):
         assert states(rows, start_s, end_s) == {ACTIVE}
     assert np.percentile(bridge.latencies_s, 95) < 0.021
 
@@ -189,17 +181,17 @@ def test_the_clock_of_the_bus_may_be_any_and_one_that_is_set_is_followed(frames,
     ],
 )
 def test_a_chain_that_fails_leaves_corrections_of_zero(frames, radps, status, state):
-    """From its 100th step on."""
+    """From its 50th step on."""
 
     def changed(step, n):
         failed = step.command._replace(wheel_radps=np.array([0.0, radps, 0.0]))
         why = "a step failed" if status is CommandStatus.FAILED else ""
-        return step if n < 100 else step._replace(command=failed, status=status, failure=why)
+        return step if n < 50 else step._replace(command=failed, status=status, failure=why)
 
     bridge = bridged(Slower(changed))
-    rows = ticks(bridge, frames, 3.0)
-    assert states(rows, 0.05, 1.9) == {ACTIVE}
-    assert states(rows, 2.1, 3.0) == {state}
+    rows = ticks(bridge, frames, 1.5)
+    assert states(rows, 0.05, 0.9) == {ACTIVE}
+    assert states(rows, 1.1, 1.5) == {state}
     assert bool(bridge.receiver.dropped) == (state == BridgeState.STEP_FAILED)
 
 
@@ -217,7 +209,7 @@ ANY_FRAME = st.builds(
 )
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(st.lists(ANY_FRAME, max_size=60), st.integers(0, 200))
 def test_no_frame_breaks_the_rule(frames, extra, every):
     """Random frames between those of a drive: finite corrections, and zero where the state says so."""
@@ -353,12 +345,18 @@ def test_a_bus_that_fails_is_opened_again_and_what_it_refuses_is_counted(monkeyp
     assert link.n_out == 0
 
 
-def test_on_a_real_virtual_bus_a_wheels_frame_is_answered_within_a_period_beside_a_flood():
-    channel, bridge = f"real-{uuid.uuid4()}", bridged()
-    link = Link(lambda: open_bus("virtual", channel))
-    with can.Bus(interface="virtual", channel=channel) as robot:
-        thread = threading.Thread(target=bridge.run, args=(link, 50.0))
-        thread.start()
+def test_on_a_real_virtual_bus_a_wheels_frame_is_answered_within_a_period_beside_a_flood_until_a_signal(
+    monkeypatch,
+):
+    """By the command, which SIGTERM ends as a service manager does: zero corrections, the bus shut down, a report."""
+    channel, bridges = f"real-{uuid.uuid4()}", []
+
+    def noted(*given):
+        bridges.append(bridged())
+        return bridges[-1]
+
+    def drive():
+        until(lambda: bridges and bridges[0].steps_s)
         rows = {"wheels": [25.0] * 3 + [1.0] * 3, "steering": [0.0] * 3, "twist": [0.5, 0, 0]}
         for number in range(25):
             for name, row in rows.items():
@@ -367,29 +365,25 @@ def test_on_a_real_virtual_bus_a_wheels_frame_is_answered_within_a_period_beside
             for _ in range(50):
                 robot.send(can.Message(arbitration_id=0x7FF, data=bytes(8), is_extended_id=False))
             time.sleep(0.02)
-        until(lambda: bridge.receiver.dropped == {"unknown id": 25 * 50})
-        bridge.stop()
+        until(lambda: bridges[0].receiver.dropped == {"unknown id": 25 * 50})
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(can_bus, "Bridge", noted)
+    with can.Bus(interface="virtual", channel=channel) as robot:
+        thread = threading.Thread(target=drive)
+        thread.start()
+        result = run(Settings(can=f"virtual:{channel}", duration_s=60.0))
         thread.join()
         received = list(iter(lambda: robot.recv(0), None))
-    assert bridge.states["ACTIVE"] >= 15
-    assert len(received) == link.n_out == 2 * (bridge.states.total() + 1)
-    assert np.median(bridge.latencies_s) < 0.03
-
-
-def test_a_signal_ends_it_in_order():
-    """SIGTERM, as a service manager sends it: zero corrections, the bus shut down, the report."""
-    channel = f"term-{uuid.uuid4()}"
-    with can.Bus(interface="virtual", channel=channel) as robot:
-        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGTERM)).start()
-        result = run(Settings(can=f"virtual:{channel}", duration_s=20.0))
-        received = list(iter(lambda: robot.recv(0), None))
-    assert result.duration_s < 5.0
-    assert result.frames_out == len(received)
+    n_steps = sum(result.states.values())
+    assert result.states["ACTIVE"] >= 15
+    assert len(received) == result.frames_out == 2 * (n_steps + 1)
+    assert result.wheels_to_correction["median_ms"] < 30.0
+    assert result.duration_s < 30.0
     assert last_state(received[-1]) == BridgeState.STOPPED
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
-    n_steps = sum(result.states.values())
-    assert f"the controller's in 0 of {n_steps} control steps" in result.report.answer
-    assert result.as_json()["states"] == {"NO_TWIST": n_steps}
+    assert f"the controller's in {result.states['ACTIVE']} of {n_steps} control steps" in result.report.answer
+    assert result.as_json()["states"] == result.states
 
 
 def test_with_a_pilot_corrections_are_what_it_commands_beyond_plain_kinematics(frames, arc):
@@ -397,9 +391,9 @@ def test_with_a_pilot_corrections_are_what_it_commands_beyond_plain_kinematics(f
     direct, plain = pilot("traction"), pilot("plain")
     expected = [
         direct.take(sample).command.wheel_radps - plain.take(sample).command.wheel_radps
-        for sample in replay(arc)
+        for sample in itertools.islice(replay(arc), 301)
     ]
-    _, added, states = zip(*ticks(bridged(pilot("traction")), frames, 10.0), strict=True)
-    np.testing.assert_allclose(added, expected[1:501], atol=RESOLUTION_RADPS)
+    _, added, states = zip(*ticks(bridged(pilot("traction")), frames, 6.0), strict=True)
+    np.testing.assert_allclose(added, expected[1:301], atol=RESOLUTION_RADPS)
     assert np.abs(added).max() > 1.0
     assert set(states) == {ACTIVE}

@@ -6,13 +6,11 @@ import itertools
 import json
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
-from contextlib import contextmanager
 
 import pytest
+from studies.service import service_process
 
 from pipelines.live.session import Hello
 from pipelines.serve.client import ServiceError, TerrainClient
@@ -22,22 +20,7 @@ from terrain.control.slip_table import load_slip_table
 
 from .strangers import CHANNELS, ask, hello, messages, running, until
 
-N_ROBOTS = 8
-
-
-@contextmanager
-def process(model_folder, states):
-    """``terrain serve`` in a process of its own; gives it, and its address."""
-    words = f"serve --model {model_folder} --port 0 --state {states}".split()
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    environment.pop("TERRAIN_TOKEN", None)
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": environment}
-    with subprocess.Popen([sys.executable, "-m", "pipelines.cli", *words], **pipes) as serving:
-        try:
-            line = serving.stdout.readline()
-            yield serving, "ws" + line[line.index("http") + 4 :].split()[0]
-        finally:
-            serving.kill()
+N_ROBOTS = 4
 
 
 def stream(url, k, run, terrains, reasons):
@@ -56,7 +39,7 @@ def stream(url, k, run, terrains, reasons):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_a_service_that_is_ended_under_load_goes_on_after_a_restart(
     model_folder, two_drives, tmp_path, number
 ):
@@ -66,9 +49,12 @@ def test_a_service_that_is_ended_under_load_goes_on_after_a_restart(
         states = {path.stem: json.loads(path.read_text())["state"] for path in tmp_path.glob("*.json")}
         return {int(name.removeprefix("robot-")): state["terrain"] for name, state in states.items()}
 
-    with process(model_folder, tmp_path) as (serving, url), process(model_folder, tmp_path) as (_, again):
+    options = ["--model", str(model_folder), "--state", str(tmp_path)]
+    with service_process(options) as serving, service_process(options) as again:
         threads = [
-            threading.Thread(target=stream, args=(url, k, two_drives[3 * (k % 2)], terrains, reasons))
+            threading.Thread(
+                target=stream, args=(serving.socket_url, k, two_drives[3 * (k % 2)], terrains, reasons)
+            )
             for k in range(N_ROBOTS)
         ]
         for thread in threads:
@@ -76,15 +62,15 @@ def test_a_service_that_is_ended_under_load_goes_on_after_a_restart(
         until(lambda: terrains == expected, 20.0)
         if number == signal.SIGKILL:
             until(lambda: saved() == expected, 15.0)
-        serving.send_signal(number)
-        code = serving.wait(10.0)
+        serving.process.send_signal(number)
+        code = serving.process.wait(10.0)
         assert code == (-signal.SIGKILL if number == signal.SIGKILL else 0)
-        assert "Traceback" not in serving.stderr.read()
+        assert "Traceback" not in serving.process.stderr.read()
         for thread in threads:
             thread.join(20)
             assert not thread.is_alive()
         for k in range(N_ROBOTS):  # of another process, so that a slow start does not make the terrain old
-            with TerrainClient(again, f"robot-{k}", "mower", CHANNELS, rate_hz=0) as robot:
+            with TerrainClient(again.socket_url, f"robot-{k}", "mower", CHANNELS, rate_hz=0) as robot:
                 assert robot.welcome["restored"]["terrain"] == expected[k]
     if number != signal.SIGKILL:
         assert all("the service ends" in reason for reason in reasons.values())
@@ -105,7 +91,7 @@ def test_a_full_disk_is_named_until_there_is_room_again(model_folder, tmp_path, 
             patch.setattr("terrain.files.atomic.os.fsync", full)
             until(lambda: "No space left on device" in trouble(service).get("states", ""))
             assert ask(robot, {"type": "samples", "streams": {}, "step": True})["type"] == "step"
-            seen = [trouble(service).get("states", "") for _ in range(30)]
+            seen = [trouble(service).get("states", "") for _ in range(15)]
             assert all(seen), "the trouble is not gone while it is tried again"
         until(lambda: trouble(service) == {})
         # saved each 50 ms: a file that is being written is there at times, one that was given up never stays

@@ -49,25 +49,7 @@ def replayed(run, model, stop_at_s=np.inf, **settings):
     return replay_run(run, chain, Settings(replay="a log", **settings), progress, stop), moments
 
 
-def test_an_observer_gives_what_predict_gives(runs, husky_model):
-    result, moments = replayed(runs[0], husky_model)
-    rows = predict([runs[0]], husky_model, TABLE)
-    assert result.chain == "observer"
-    assert [(w.start_s, w.terrain, w.label) for w in result.windows] == [
-        (row.start_s, row.terrain, row.label) for row in rows.windows
-    ]
-    np.testing.assert_allclose(
-        [w.probability for w in result.windows], [row.probability for row in rows.windows], atol=1e-12
-    )
-    assert (result.accuracy, result.n_judged) == (rows.accuracy, rows.n_judged)
-    assert result.n_windows > 8
-    assert sum(result.terrains.values()) == pytest.approx(1.0)
-    assert sum(result.believed.values()) == pytest.approx(1.0)
-    assert [done for _, done in moments] == list(range(1, len(moments) + 1))
-    assert result.duration_s == pytest.approx(24.0, abs=0.1)
-
-
-def test_a_pilot_gives_what_predict_gives_though_another_controller_drove(grass, swerve_model):
+def test_a_pilot_gives_what_predict_gives_though_another_controller_drove(grass, runs, swerve_model):
     result, _ = replayed(grass, swerve_model)
     rows = predict([grass], swerve_model, TABLE).windows
     assert result.chain == "pilot"
@@ -75,9 +57,6 @@ def test_a_pilot_gives_what_predict_gives_though_another_controller_drove(grass,
     assert result.windows[-1].believed == "grass"
     grass_ratio = TABLE.lookup("grass")["traction"].slip_ratio
     assert result.windows[-1].target_ratio == pytest.approx(grass_ratio, abs=0.05)
-
-
-def test_a_pilot_needs_no_model_and_another_robot_does(grass, runs):
     result, _ = replayed(grass, None)
     assert (result.n_windows, result.accuracy, dict(result.believed)) == (0, None, {"": 1.0})
     with pytest.raises(ConfigError, match=r"robot 'husky' has no pilot: give a model with --model"):
@@ -99,6 +78,7 @@ def test_a_run_that_lacks_what_is_needed_is_refused_in_a_sentence(grass, runs, h
 
 def test_the_speed_is_that_of_the_clock_until_it_is_to_end(runs, husky_model):
     result, moments = replayed(runs[1], husky_model, stop_at_s=18.0, speed=20.0)
+    assert [done for _, done in moments] == list(range(1, len(moments) + 1))
     begin_s = moments[0][0] - moments[0][1] / 20
     assert min(wall_s - begin_s - done / 20 for wall_s, done in moments) > -0.06
     assert result.times_real_time == pytest.approx(20.0, rel=0.2)
@@ -120,17 +100,28 @@ def logs(tmp_path, runs):
     return tmp_path / "logs"
 
 
-def test_serve_replays_all_runs_of_a_folder_and_prints_changes(logs, husky_folder, capsys):
+def test_serve_replays_all_runs_of_a_folder_as_predict_and_prints_changes(
+    runs, husky_model, logs, husky_folder, capsys
+):
     result = serve(Settings(replay=logs, model=str(husky_folder)))
-    assert [run.run_id for run in result.runs] == ["ASPHALT_1", "ASPHALT_2"]
-    assert result.n_windows == sum(len(run.windows) for run in result.runs) > 16
-    assert not result.interrupted
-    printed = capsys.readouterr().out.splitlines()
-    changes = [
-        run.run_id
-        for run in result.runs
-        for _ in itertools.groupby((w.terrain, w.believed) for w in run.windows)
+    rows = predict(runs[:2], husky_model, TABLE)
+    windows = [window for run in result.runs for window in run.windows]
+    assert [(w.start_s, w.terrain, w.label) for w in windows] == [
+        (row.start_s, row.terrain, row.label) for row in rows.windows
     ]
+    found, expected = ([one.probability for one in each] for each in (windows, rows.windows))
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert (result.accuracy, result.n_judged) == (rows.accuracy, rows.n_judged)
+    assert result.n_windows == len(windows) > 16
+    assert not result.interrupted
+    printed, changes = capsys.readouterr().out.splitlines(), []
+    for run in result.runs:
+        assert run.chain == "observer"
+        assert run.duration_s == pytest.approx(24.0, abs=0.1)
+        for found in (run.terrains, run.believed):
+            assert sum(found.values()) == pytest.approx(1.0)
+        changes += [run.run_id for _ in itertools.groupby((w.terrain, w.believed) for w in run.windows)]
+    assert [run.run_id for run in result.runs] == ["ASPHALT_1", "ASPHALT_2"]
     assert [line.split()[0] for line in printed] == changes
     assert "believed unknown" in printed[0]
     assert len(result.to_pandas()) == result.n_windows

@@ -23,55 +23,48 @@ from .strangers import CHANNELS, ask, hello, messages, running, until
 TABLE = (data_folder("target_slip") / "default.yaml").read_text()
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_a_robot_gets_the_terrain_and_target_slips_of_its_samples(service, two_drives, mower_model, packed):
+def test_a_robot_gets_the_terrain_and_target_slips_of_its_samples(service, two_drives, mower_model):
+    """In MessagePack; JSON is what the other tests speak."""
     run, observer = two_drives[4], Observer(mower_model)
-    found, seen = [], []
-    for sample in replay(run):
-        found += observer.update(sample.readings)
-    ends_s = [one.start_s + 2.0 for one in found]
+    found = [one for sample in replay(run) for one in observer.update(sample.readings)]
+    seen = []
     with service.socket() as socket:
-        say = partial(ask, socket, packed=packed)
-        welcome = say(hello(f"alone-{packed}"))
+        say = partial(ask, socket, packed=True)
+        welcome = say(hello("alone"))
         assert (welcome["type"], welcome["served"]["classes"]) == ("welcome", ["a", "b"])
 
-        def is_classified(n_windows):
+        def is_classified(start_s):
             seen.append(say({"type": "samples", "streams": {}, "step": True})["observation"])
-            return len({one["window"]["start_s"] for one in seen if one["window"]}) >= n_windows
+            return seen[-1]["window"] and seen[-1]["window"]["start_s"] == start_s
 
+        due = iter(found)
         for message in messages(run):
             answer = say(message)
             assert (answer["type"], answer["time_s"]) == ("step", message["time_s"])
             seen.append(answer["observation"])
-            due = sum(end_s < message["time_s"] - 0.1 for end_s in ends_s)
-            until(lambda due=due: is_classified(due))
-        until(lambda: is_classified(len(found)))
-    windows = {}
-    for one in seen:
-        if one["window"]:
-            windows[one["window"]["start_s"]] = one["window"]
+            if message["time_s"] > 0.1 and message["time_s"] % 2.0 < 0.01:  # faster than its thread: it waits
+                until(partial(is_classified, next(due).start_s))
+        until(partial(is_classified, found[-1].start_s))
+    windows = {one["window"]["start_s"]: one["window"] for one in seen if one["window"]}
     assert list(windows) == [one.start_s for one in found]
     for one in found:
         assert windows[one.start_s]["terrain"] == one.terrain
         assert windows[one.start_s]["probabilities"] == pytest.approx(one.probabilities, abs=1e-12)
-    assert seen[-1]["terrain"] == "b"
-    assert (
-        seen[-1]["target_slip"]["traction"]["slip_ratio"]
-        == load_slip_table().lookup("b")["traction"].slip_ratio
-    )
-    assert seen[-1]["slip_ratio"] == []
+    target = load_slip_table().lookup("b")["traction"].slip_ratio
+    assert (seen[-1]["terrain"], seen[-1]["slip_ratio"]) == ("b", [])
+    assert seen[-1]["target_slip"]["traction"]["slip_ratio"] == target
 
 
 def test_steps_come_at_the_rate_that_was_asked_for(service):
     with TerrainClient(service.ws, "ticking", "mower", CHANNELS, rate_hz=50.0) as client:
         begun_s, n_sent = time.monotonic(), 0
-        while time.monotonic() - begun_s < 1.0:
+        while time.monotonic() - begun_s < 0.6:
             client.send({"imu": ([n_sent / 100], [[0.1]]), "wheels": ([n_sent / 100], [[0.5]])})
             n_sent += 1
             time.sleep(0.01)
         step = client.latest()
         assert step["message"] >= n_sent - 20
-        assert 25 <= client.n_steps <= 51
+        assert 15 <= client.n_steps <= 31
         assert step["observation"]["sensors"] == {"imu": "fresh", "wheels": "fresh"}
         assert "command" not in step
         assert list(client.errors) == []
@@ -126,10 +119,15 @@ def test_health_card_and_figures_in_the_form_of_prometheus(service, two_drives):
         for message in list(messages(two_drives[0]))[:100]:
             say(message)
         during = figures()
-        assert [one["session"] for one in json.loads(service.get("/sessions")[1])] == ["counted"]
-        assert json.loads(service.get("/state")[1])["session"]["step"]["number"] == 100
-    rises = {name: during[f"terrain_{name}"] - before[f"terrain_{name}"] for name in RISES}
-    assert rises == RISES
+        assert "counted" in [one["session"] for one in json.loads(service.get("/sessions")[1])]
+        assert json.loads(service.get("/state?session=counted")[1])["session"]["step"]["number"] == 100
+    expected = {
+        "opened_sessions_total": 1,
+        "messages_total": 100,
+        "rows_total": 200,
+        "step_seconds_count": 100,
+    }
+    assert {name: during[f"terrain_{name}"] - before[f"terrain_{name}"] for name in expected} == expected
     assert 1e7 < during["process_resident_memory_bytes"] < 1e10
     assert json.loads(service.get("/health")[1])["status"] == "ok"
     status, text = service.get("/ready")
@@ -137,9 +135,6 @@ def test_health_card_and_figures_in_the_form_of_prometheus(service, two_drives):
     card = json.loads(service.get("/model")[1])
     assert (card["card"]["classes"], card["served"]["number"]) == (["a", "b"], 1)
     assert service.get("/nothing")[0] == 404
-
-
-RISES = {"sessions": 1, "messages_total": 100, "rows_total": 200, "step_seconds_count": 100}
 
 
 def test_another_model_is_put_in_while_a_robot_is_served_and_no_window_is_lost(model_folder, two_drives):
@@ -150,7 +145,7 @@ def test_another_model_is_put_in_while_a_robot_is_served_and_no_window_is_lost(m
             if k == 150:
                 put = service.put("/model", {"uri": str(model_folder)})
             if k == 320:
-                put = service.put("/table", TABLE.replace("0.1", "0.11"), "application/yaml")
+                put = service.put("/table", TABLE.replace("0.1", "0.11"))
             seen = ask(socket, message)["observation"]
             time.sleep(0.0005)
             numbers.append(seen["served"])
@@ -162,27 +157,26 @@ def test_another_model_is_put_in_while_a_robot_is_served_and_no_window_is_lost(m
 
 
 @pytest.mark.parametrize(
-    ("place", "content", "kind", "status", "fault"),
+    ("place", "content", "status", "fault"),
     [
-        ("/model", {"uri": "/nowhere"}, "application/json", 409, "is neither a folder nor a model URI"),
-        ("/model", "damaged", "application/json", 409, "model"),
-        ("/model", {"url": "x"}, "application/json", 422, "uri"),
-        ("/model", "[" * 100_000, "application/json", 400, "error parsing"),
-        ("/table", "name: [", "application/yaml", 409, "the table: is no YAML"),
-        ("/table", "name: x", "application/yaml", 409, "the table"),
-        ("/table", "x" * 300_000, "application/yaml", 413, "Too Large"),
-        ("/model", "x" * 300_000, "application/json", 413, "Too Large"),
+        ("/model", {"uri": "/nowhere"}, 409, "is neither a folder nor a model URI"),
+        ("/model", "damaged", 409, "model"),
+        ("/model", {"url": "x"}, 422, "uri"),
+        ("/model", "[" * 100_000, 400, "error parsing"),
+        ("/table", "name: [", 409, "the table: is no YAML"),
+        ("/table", "name: x", 409, "the table"),
+        *((place, "x" * 300_000, 413, "Too Large") for place in ("/table", "/model")),
     ],
 )
 def test_what_cannot_be_served_is_refused_and_the_old_goes_on(
-    service, model_folder, tmp_path, place, content, kind, status, fault
+    service, model_folder, tmp_path, place, content, status, fault
 ):
     if content == "damaged":
         for file in model_folder.iterdir():
             (tmp_path / file.name).write_bytes(file.read_bytes()[:-100])
         content = {"uri": str(tmp_path)}
     number = service.hub.served.number
-    found, text = service.put(place, content, kind)
+    found, text = service.put(place, content)
     assert found == status, text
     assert fault in text
     assert "Traceback" not in text

@@ -33,7 +33,6 @@ DRIVEN = {
     "control": True,
     "streams": {"wheels": [f"motor_{i}_radps" for i in (1, 2, 3)]},
 }
-MANY = 1000
 
 
 def resident_bytes():
@@ -42,11 +41,11 @@ def resident_bytes():
 
 @pytest.fixture(scope="module")
 def guarded(model_folder, tmp_path_factory):
-    """A service that requires a token, whose wrong tokens wait for a fifth of a second."""
+    """A service that requires a token, whose wrong tokens wait for a twentieth of a second."""
     file = tmp_path_factory.mktemp("token") / "token"
     file.write_text(TOKEN)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipelines.serve.hub.WRONG_TOKEN_S", 0.2)
+        patch.setattr("pipelines.serve.hub.WRONG_TOKEN_S", 0.05)
         with running(model=str(model_folder), host="::1", token_file=file) as service:
             yield service
 
@@ -69,28 +68,21 @@ def samples(stamp_s, **more):
     return {**content, **more}
 
 
-@pytest.mark.parametrize(
-    ("when", "reset"),
-    [
-        ("in a frame", False),
-        ("between frames", True),
-        ("between fragments", True),
-        ("with the welcome", False),
-    ],
-)
-def test_a_robot_that_is_gone_without_a_message_leaves_nothing_behind(service, reset, when):
-    for k in range(5):
-        name = f"gone-{reset}-{when.replace(' ', '')}-{k}"
-        with raw(service, None if when == "with the welcome" else hello(name)) as line:
-            whole = frame(json.dumps({"type": "samples", "streams": {}, "step": True}).encode())
-            sent = {
-                "in a frame": whole[: len(whole) // 2],
-                "between fragments": frame(b'{"type": ', fin=False),
-            }
-            first = frame(json.dumps(hello(name)).encode()) if when == "with the welcome" else whole
-            line.sendall(sent.get(when, first))
-            if reset:
-                line.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+def test_a_robot_that_is_gone_without_a_message_leaves_nothing_behind(service):
+    """In the middle of its hello's answer, of a frame, between frames and fragments; in order or by a reset."""
+    whole = frame(json.dumps({"type": "samples", "streams": {}, "step": True}).encode())
+    for name, reset, last in (
+        ("gone-half", False, whole[: len(whole) // 2]),
+        ("gone-whole", True, whole),
+        ("gone-fragment", True, frame(b'{"type": ', fin=False)),
+        ("gone-greeted", False, None),
+    ):
+        for k in range(5):
+            first = hello(f"{name}-{k}")
+            with raw(service, None if last is None else first) as line:
+                line.sendall(frame(json.dumps(first).encode()) if last is None else last)
+                if reset:
+                    line.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
     time.sleep(0.1)
     until(lambda: not [one for one in service.hub.sessions if one.startswith("gone")])
     assert service.hub.trouble == {}
@@ -120,7 +112,7 @@ MESSAGE = st.one_of(
 )
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.lists(MESSAGE, min_size=1, max_size=20), st.sampled_from([0, 50]), st.booleans())
 def test_each_message_is_answered_or_taken(driving, given_messages, rate_hz, packed):
     """Of a robot that gets commands: they are numbers, whatever is sent."""
@@ -146,18 +138,19 @@ def test_each_message_is_answered_or_taken(driving, given_messages, rate_hz, pac
 
 
 def test_large_messages_are_decoded_in_a_thread_too_large_ones_refused_and_larger_ones_close_the_connection(
-    service, decoded
+    service, decoded, monkeypatch
 ):
+    patient = Limits()._replace(bytes_per_s=1e9, decoding_s_per_s=100.0)
+    monkeypatch.setattr(service.hub, "limits", patient)
     with service.socket() as robot:
         assert ask(robot, hello("large"))["type"] == "welcome"
         for size in (1_000, 100_000):
             assert ask(robot, {"type": "x" * size})["code"] == "unknown-type"
         assert [in_thread for _, in_thread in decoded] == [False, False, True]
-        for filling in ("x" * Limits().message_bytes, "x" * 1_000_000):
+        for filling in ("x" * patient.message_bytes, "x" * 1_000_000):
             answer = ask(robot, {"type": filling})
             assert (answer["code"], answer["fatal"]) == ("too-large", False)
-            time.sleep(0.5)
-        assert ask(robot, b"\xc0" * (Limits().message_bytes + 1))["code"] == "too-large"
+        assert ask(robot, b"\xc0" * (patient.message_bytes + 1))["code"] == "too-large"
     with raw(service) as line:
         line.sendall(frame(b"x" * 1_100_000)[:14])
         assert line.recv(4)[2:] == struct.pack("!H", 1009)
@@ -173,7 +166,7 @@ def test_before_its_token_nothing_of_a_client_is_decoded_and_wrong_tokens_wait_a
         with guarded.socket() as stranger:
             answer = ask(stranger, first)
             assert (answer["code"], answer["fatal"]) == ("token", True)
-            assert time.monotonic() - begun_s > 0.19
+            assert time.monotonic() - begun_s > 0.049
             with pytest.raises(ConnectionClosed):
                 stranger.recv(10)
     another = {"Authorization": "Bearer another"}
@@ -204,8 +197,9 @@ def test_a_token_comes_in_the_header_or_as_the_first_frame(guarded, monkeypatch)
 
 
 def test_before_its_hello_a_client_is_answered_once_at_a_time_and_large_messages_are_not_decoded(
-    service, decoded
+    service, decoded, monkeypatch
 ):
+    monkeypatch.setattr(connection, "PAUSE_S", 0.2)
     with service.socket() as stranger:
         begun_s = time.monotonic()
         assert ask(stranger, '{"type": [' + "0.1," * 60_000)["code"] == "too-large"
@@ -227,20 +221,18 @@ def test_more_robots_than_are_accepted_wait_until_one_has_left(guarded, monkeypa
         assert ask(late, hello("late"))["type"] == "welcome"
 
 
-@pytest.mark.parametrize(
-    "part",
-    ["", "GET /health HT", "PUT /table HTTP/1.1\r\nHost: {host}\r\nContent-Length: 9\r\n\r\nhalf"],
-    ids=["nothing", "head", "body"],
-)
-def test_requests_that_do_not_come_whole_are_ended(driving, monkeypatch, part):
+def test_requests_that_do_not_come_whole_are_ended(driving, monkeypatch):
+    """A thousand connections that say nothing, half a head, half a body, a WebSocket without a hello."""
     monkeypatch.setattr(guard, "REQUEST_S", 1.0)
     place = urlsplit(driving.http)
-    lines = [socket.create_connection((place.hostname, place.port), 10) for _ in range(1 if part else MANY)]
+    body = f"PUT /table HTTP/1.1\r\nHost: {place.netloc}\r\nContent-Length: 9\r\n\r\nhalf"
+    parts = [*[b""] * 1000, b"GET /health HT", body.encode()]
+    lines = [socket.create_connection((place.hostname, place.port), 10) for _ in parts]
     begun_s = time.monotonic()
+    for line, part in zip(lines, parts, strict=True):
+        line.sendall(part)
     with raw(driving) as greeted:
         assert b"no hello came in time" in greeted.recv(1000)
-    for line in lines:
-        line.sendall(part.format(host=place.netloc).encode())
     for line in lines:
         line.settimeout(10)
         with suppress(ConnectionResetError):
@@ -289,7 +281,7 @@ def test_a_slow_receiver_that_goes_on_gets_fresh_commands(driving, monkeypatch):
     """Of what came while it did not read, only what the line held already is old."""
     monkeypatch.setattr(driving.hub, "limits", driving.hub.limits._replace(too_slow_s=5.0))
     with raw(driving, {**DRIVEN, "rate_hz": 100, "session": "resumes"}, buffer=4096) as slow:
-        end_s = time.monotonic() + 1.5
+        end_s = time.monotonic() + 1.0
         while time.monotonic() < end_s:
             slow.sendall(frame(json.dumps(samples(time.monotonic())).encode()))
             time.sleep(0.02)
@@ -305,7 +297,7 @@ def test_a_slow_receiver_that_goes_on_gets_fresh_commands(driving, monkeypatch):
             if not received.startswith(b'{"type'):
                 received = b'{"type":"step",' + received
     n_old = sum(age > 0.25 for age in ages)
-    assert n_old <= 40, "of 150 steps that it did not read"
+    assert n_old <= 40, "of 100 steps that it did not read"
     assert len(ages) > n_old + 20
     assert max(ages[n_old:]) <= 0.25
 
