@@ -49,14 +49,12 @@ TINY = 1e-12  #: Absolute: what should be 0 and is rounding
 LOOSE: dict[str, dict[str, float]] = {
     "estimate_swerve": {"/steps/04/json": 2e-3},
     "testbed": {"/steps/03/json": 2e-2},
-    "bench": {"/steps/00/json": 1.0},
 }
 """By case, the paths that are compared by a relative tolerance of their own.
 
 In ``estimate_swerve`` step 4 is the tuning ``likelihood``: its search stops where the likelihood is flat, so
 that rounding of 1e-13 in the measurements moves the scale of the gyro's bias by 1e-3, and figures by 1e-6.
-In ``testbed`` the fits of step 3 end where the sum of squares changes by 1e-5.
-In ``bench`` they are what the machine gives: that they are there and above zero is compared."""
+In ``testbed`` the fits of step 3 end where the sum of squares changes by 1e-5."""
 
 _RANDOM_ID = re.compile(r"[0-9a-f]{32}|[0-9a-f]{40}|[0-9a-f]{64}")
 

@@ -2,14 +2,14 @@
 
 To keep the results of one state of the code, all or of some cases, from the folder ``tests``::
 
-    python -m behaviour.record --terrain ../.venv/bin/terrain
-    python -m behaviour.record --terrain ../.venv/bin/terrain --out other --only slip,drive
+    python -m behaviour.record
+    python -m behaviour.record --out other --only slip,drive
 
 (The name ``tests`` is taken: a package that the benchmarks need installs one of that name.)
 
-A result holds, for each step, exit code and JSON; of each stream of each run folder, a few statistics of
-each channel; of each HTML page, its outline; of each YAML and JSON file, all of it; of MLflow, parameters and
-metrics; of a picture, that it is there.
+The commands are called in this process: to start one anew takes longer than most of them.  A result holds, for
+each step, exit code and JSON; of each stream of each run folder, a few statistics of each channel; of each HTML page,
+its outline; of each YAML and JSON file, all of it; of MLflow, parameters and metrics; of a picture, that it is there.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ import json
 import math
 import os
 import re
-import shlex
-import shutil
 import sqlite3
-import subprocess
+import sys
 import tempfile
 import time
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import ExitStack, chdir, closing, contextmanager, redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
+
+from pipelines.cli import main as cli
 
 from .commands import CASES, Case, Step
 
 EXPECTED = Path(__file__).with_name("expected")
-
-TIMEOUT_S = 900.0
 
 LONG = 40  #: So many numbers in a list are kept as statistics
 BIG_BYTES = 100_000  #: A bigger result is kept compressed
@@ -46,20 +46,19 @@ PARTS = ("section", "h2", "h3", "table", "svg", "img", "figure")  #: Elements of
 
 ALIASES_QUERY = "select name, alias, version from registered_model_aliases order by name"
 
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
-
-def run_case(case: Case, terrain: Sequence[str], folder: Path) -> dict[str, Any]:
-    """Return the result of a case that is run in an empty folder, by the command's first words."""
+def run_case(case: Case, folder: Path) -> dict[str, Any]:
+    """Return the result of a case that is run in an empty folder."""
     given = case.make()
     for name, content in given.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
-    result: dict[str, Any] = {
-        "steps": {f"{i:02d}": _run_step(step, i, terrain, folder) for i, step in enumerate(case.steps)}
-    }
-    if case.helps:
-        result["help"] = {name or "terrain": _helped(name, terrain, folder) for name in case.helps}
+    with working_in(folder):
+        result: dict[str, Any] = {
+            "steps": {f"{i:02d}": _run_step(step, i, folder) for i, step in enumerate(case.steps)}
+        }
+        if case.helps:
+            result["help"] = {name or "terrain": _helped(name) for name in case.helps}
     tracking = folder / "mlruns" / "mlflow.db"
     if tracking.exists():
         result["tracking"] = tracked(tracking)
@@ -151,40 +150,51 @@ def keep_result(name: str, result: dict[str, Any], folder: Path) -> Path:
     return path
 
 
-def _environment() -> dict[str, str]:
-    """Return the environment without a tracking server and without measured data, one thread a process."""
+@contextmanager
+def working_in(folder: Path) -> Iterator[None]:
+    """Work in a folder without a tracking server and without measured data."""
     left_out = ("MLFLOW_TRACKING_URI", "TERRAIN_DATA", "COLUMNS")
     kept = {name: value for name, value in os.environ.items() if name not in left_out}
-    return {**kept, **dict.fromkeys(_THREADS, "1"), "MPLBACKEND": "Agg"}
+    with chdir(folder), patch.dict(os.environ, {**kept, "MPLBACKEND": "Agg"}, clear=True):
+        yield
 
 
-def _run(words: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        words,
-        cwd=folder,
-        env=_environment(),
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        encoding="utf-8",
-        check=False,
-        timeout=TIMEOUT_S,
-    )
+class Done(NamedTuple):
+    """What a command line gave."""
+
+    code: int
+    out: str
+    err: str
 
 
-def _run_step(step: Step, i: int, terrain: Sequence[str], folder: Path) -> dict[str, Any]:
+def _run(words: list[str]) -> Done:
+    out, err, code = StringIO(), StringIO(), 0
+    with ExitStack() as around:
+        for context in (
+            redirect_stdout(out),
+            redirect_stderr(err),
+            patch.object(sys, "argv", ["terrain", *words]),
+        ):
+            around.enter_context(context)
+        try:
+            cli.main()
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+    return Done(code, out.getvalue(), err.getvalue())
+
+
+def _run_step(step: Step, i: int, folder: Path) -> dict[str, Any]:
     file = folder / f"step_{i:02d}.json"
     options = [] if step.code else ["--json", file.name]
-    done = _run([*terrain, *step.words.split(), *options], folder)
-    result: dict[str, Any] = {"line": step.words, "code": done.returncode}
-    if done.returncode != step.code:
-        result["stderr"] = done.stderr[-2000:]
+    done = _run([*step.words.split(), *options])
+    result: dict[str, Any] = {"line": step.words, "code": done.code}
+    if done.code != step.code:
+        result["stderr"] = done.err[-2000:]
     elif step.code:
-        lines = done.stderr.splitlines()
         result["refusal"] = {
-            "lines": len(lines),
-            "begins_with_error": done.stderr.startswith("error: "),
-            "silent_on_stdout": not done.stdout,
+            "lines": len(done.err.splitlines()),
+            "begins_with_error": done.err.startswith("error: "),
+            "silent_on_stdout": not done.out,
         }
     if file.exists():
         result["json"] = json.loads(file.read_text(encoding="utf-8"))
@@ -192,11 +202,11 @@ def _run_step(step: Step, i: int, terrain: Sequence[str], folder: Path) -> dict[
     return result
 
 
-def _helped(name: str, terrain: Sequence[str], folder: Path) -> dict[str, Any]:
-    done = _run([*terrain, *name.split(), "--help"], folder)
-    options = sorted(set(re.findall(r"^  (--[a-z-]+)", done.stdout, flags=re.MULTILINE)))
-    commands = re.findall(r"^  ([a-z][a-z-]*)  +\S", "" if name else done.stdout, flags=re.MULTILINE)
-    return {"code": done.returncode, "options": options, "commands": sorted(commands)}
+def _helped(name: str) -> dict[str, Any]:
+    done = _run([*name.split(), "--help"])
+    options = sorted(set(re.findall(r"^  (--[a-z-]+)", done.out, flags=re.MULTILINE)))
+    commands = re.findall(r"^  ([a-z][a-z-]*)  +\S", "" if name else done.out, flags=re.MULTILINE)
+    return {"code": done.code, "options": options, "commands": sorted(commands)}
 
 
 def _tree(folder: Path, given: set[Path]) -> dict[str, Any]:
@@ -253,19 +263,15 @@ def _number(text: Any) -> Any:
 
 def main() -> None:
     """Run cases and keep their results."""
-    parser = argparse.ArgumentParser(description="Run the cases and keep what came out.")
-    parser.add_argument("--terrain", required=True, help="the command to run")
-    parser.add_argument("--out", type=Path, default=EXPECTED, help="folder of the results")
-    parser.add_argument("--only", help="cases, by commas; all by default")
-    given = parser.parse_args()
-    names = given.only.split(",") if given.only else [case.name for case in CASES]
-    command, *words = shlex.split(given.terrain)
-    terrain = [str(Path(shutil.which(command) or command).absolute()), *words]  # it runs in other folders
     by_name = {case.name: case for case in CASES}
-    for name in names:
+    parser = argparse.ArgumentParser(description="Run the cases and keep what came out.")
+    parser.add_argument("--out", type=Path, default=EXPECTED, help="folder of the results")
+    parser.add_argument("--only", default=",".join(by_name), help="cases, by commas; all by default")
+    given = parser.parse_args()
+    for name in given.only.split(","):
         start_s = time.monotonic()
         with tempfile.TemporaryDirectory() as folder:
-            result = run_case(by_name[name], terrain, Path(folder).resolve())
+            result = run_case(by_name[name], Path(folder).resolve())
         path = keep_result(name, result, given.out)
         failed = [step["line"] for step in result["steps"].values() if "stderr" in step]
         print(f"{name}: {time.monotonic() - start_s:.1f} s, {path.stat().st_size} bytes", *failed, flush=True)

@@ -76,10 +76,8 @@ class LiveLatencies(Result):
     step_paced_us: Spread = described("one at 50 Hz in real time, where nothing is warm", "us")
     window_ms: Spread = described("from a whole window to its terrain", "ms")
     websocket_ms: Spread = described("round trip of one robot at 100 Hz", "ms")
-    sessions: int = described("robots at once")
-    sessions_p99_ms: float = described("round trip of as many robots, 99th percentile", "ms")
-    lost_samples: int = described("of as many robots at once")
-    by_sessions: tuple[SessionsLatency, ...] = described("the same of fewer and more")
+    sessions: int = described("robots at once that were asked for")
+    by_sessions: tuple[SessionsLatency, ...] = described("round trip of as many robots, of fewer and of more")
     start_s: float = described("from the start of the service's process to its first observation", "s")
     rss_mb: float = described("resident memory then", "MB")
     rss_loaded_mb: float = described("resident memory after all robots", "MB")
@@ -110,52 +108,37 @@ class _Thread(ThreadPoolExecutor):
         return self.last is not None and not self.last.done()
 
 
-def step_times_us(robot: Robot, model: Any, run: RunLog, repeats: int = REPEATS) -> tuple[Spread, Spread]:
-    """Return the times of steps as fast as a log goes: alone, and while the thread classifies a window.
+def step_times_us(
+    robot: Robot, model: Any, run: RunLog, *, waits: bool = True, seconds: float = math.inf
+) -> dict[bool, list[float]]:
+    """Return the times of the steps of a log, of those beside a window that the thread classifies by True.
 
-    The log goes by hundreds of times faster than a robot drives, and its windows with it; a robot's thread is
-    at a window for a five hundredth of the time.  Steps alone wait until the thread has nothing to do, those
-    beside a window do not.
+    By default as fast as it goes.  That is hundreds of times faster than a robot drives, and its windows with it; a
+    robot's thread is at a window for a five hundredth of the time.
+
+    Parameters
+    ----------
+    waits : whether a step waits until the thread has nothing to do
+    seconds : of the log, at its own rate in real time: between two steps the memory goes cold
     """
-    samples = list(replay(run, STEP_RATE_HZ))
-    thread = _Thread(1)
-    times_us: dict[bool, list[float]] = {False: [], True: []}
+    thread, times_us = _Thread(1), {False: [], True: []}
     try:
         with _as_served():
-            for waiting in (True, False):
-                for number in range(repeats + 1):
-                    pilot = LivePilot(robot, source=Classifier(model, robot, thread))
-                    for sample in samples:
-                        beside = thread.busy
-                        begun_s = perf_counter()
-                        pilot.step(sample)
-                        took_us = (perf_counter() - begun_s) * 1e6
-                        if number and beside is not waiting:  # the first run compiles and loads
-                            times_us[beside].append(took_us)
-                        while waiting and thread.busy:
-                            sleep(0.0)
-    finally:
-        thread.shutdown(cancel_futures=True)
-    return spread(times_us[False]), spread(times_us[True])
-
-
-def paced_step_times_us(robot: Robot, model: Any, run: RunLog, seconds: float) -> Spread:
-    """Return the time of a step at its own rate in real time: between two of them the memory goes cold."""
-    thread, times_us = ThreadPoolExecutor(1), []
-    try:
-        with _as_served():
-            pilot = LivePilot(robot, source=Classifier(model, robot, thread))
-            begin_s = monotonic()
+            pilot, begin_s = LivePilot(robot, source=Classifier(model, robot, thread)), monotonic()
             for sample in replay(run, STEP_RATE_HZ):
                 if sample.time_s > seconds:
                     break
-                sleep(max(begin_s + sample.time_s - monotonic(), 0.0))
+                if math.isfinite(seconds):
+                    sleep(max(begin_s + sample.time_s - monotonic(), 0.0))
+                beside = thread.busy
                 begun_s = perf_counter()
                 pilot.step(sample)
-                times_us.append((perf_counter() - begun_s) * 1e6)
+                times_us[beside].append((perf_counter() - begun_s) * 1e6)
+                while waits and thread.busy:
+                    sleep(0.0)
     finally:
         thread.shutdown(cancel_futures=True)
-    return spread(times_us[len(times_us) // 10 :])
+    return times_us
 
 
 def window_times_ms(windows: Windows, model: Any) -> Spread:
@@ -175,9 +158,18 @@ def run(settings: Settings, progress: Progress = silent) -> LiveLatencies:
         uri = model_folder(settings.model, settings.seed, Path(folder) / "model")
         model = read_model(uri)
         progress("live", 1, n_stages)
-        steps, beside = step_times_us(robot, model, log)
+        step_times_us(robot, model, log)  # compiles and loads
+        steps, beside = (
+            [
+                us
+                for _ in range(REPEATS)
+                for us in step_times_us(robot, model, log, waits=not at_once)[at_once]
+            ]
+            for at_once in (False, True)
+        )
         progress("live", 2, n_stages)
-        paced = paced_step_times_us(robot, model, log, settings.seconds)
+        paced = step_times_us(robot, model, log, waits=False, seconds=settings.seconds)
+        paced_us = [us for each in paced.values() for us in each]
         progress("live", 3, n_stages)
         cut = cut_windows(
             [enriched(estimate_run(log, robot, "vio15"))], model.info.rule, layout=model.info.layout
@@ -204,11 +196,9 @@ def run(settings: Settings, progress: Progress = silent) -> LiveLatencies:
                 by_sessions.append(SessionsLatency(n, times.p99, times.median, lost))
                 progress("live", 6 + stage, n_stages)
             rss_loaded_mb = service.rss_mb
-    asked = by_sessions[0]
     return LiveLatencies(
-        *(steps, beside, paced, window_ms, spread(one.times_ms[20:])),
-        *(asked.sessions, asked.p99_ms, asked.lost_samples, tuple(sorted(by_sessions))),
-        *(start_s, rss_mb, rss_loaded_mb),
+        *(spread(steps), spread(beside), spread(paced_us), window_ms, spread(one.times_ms[20:])),
+        *(by_sessions[0].sessions, tuple(sorted(by_sessions)), start_s, rss_mb, rss_loaded_mb),
     )
 
 
@@ -228,11 +218,12 @@ def report(result: LiveLatencies) -> Report:
     latencies = tuple((name, unit, *found) for name, unit, found in stages)
     many = tuple((one.sessions, one.median_ms, one.p99_ms, one.lost_samples) for one in result.by_sessions)
     columns = ("robots", Column("median", ".2f", "ms"), Column("99 %", ".2f", "ms"), "samples lost")
+    asked = next(each for each in result.by_sessions if each.sessions == result.sessions)
     return Report(
         "The live chain and the service",
         f"A control step takes {result.step_us.median:.3g} us, a window {result.window_ms.median:.3g} ms; of "
-        f"{result.sessions} robots 99 % of the answers come within {result.sessions_p99_ms:.3g} ms, and "
-        f"{result.lost_samples} samples are lost.",
+        f"{asked.sessions} robots 99 % of the answers come within {asked.p99_ms:.3g} ms, and "
+        f"{asked.lost_samples} samples are lost.",
         parts=(
             Table(("stage", "unit", "median", "99 %", "largest"), latencies, title="Latency"),
             Table(columns, many, title="Control steps at 20 Hz, samples at 100 Hz"),

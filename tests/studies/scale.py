@@ -6,14 +6,14 @@ Runs are generated: cheap noise with the spectrum of its terrain, no simulated r
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Event, Thread
 from time import perf_counter
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import field_validator
@@ -30,7 +30,6 @@ EXAMPLE = "python tests/studies scale --runs 10000 --workers 1,2"
 FRACTIONS = (0.1, 0.3, 1.0)
 """Of the runs that were asked for: three sizes show whether time and memory follow their number."""
 WARM_RUNS = 24  #: Before a measurement: processes are started, kernels are compiled and loaded
-N_GENERATED = 50  #: Runs by which the time to generate one is measured
 RUN_S = 20.0
 IMU_RATE_HZ, WHEEL_RATE_HZ = 50.0, 10.0
 IMU = ("gyro_x_radps", "gyro_y_radps", "gyro_z_radps", "accel_x_mps2", "accel_y_mps2", "accel_z_mps2")
@@ -67,13 +66,12 @@ class Settings(BaseSettings):
 
 
 class Point(NamedTuple):
-    """Features of so many runs by so many processes; ``cpu_s`` and ``peak_mb`` are of all together."""
+    """Features of so many runs by so many processes; ``peak_mb`` is of all together."""
 
     n_runs: int
     n_workers: int
     seconds: float
     runs_per_s: float
-    cpu_s: float
     peak_mb: float
 
 
@@ -82,18 +80,7 @@ class ScaleResult(Result):
 
     run_s: float = described("length of a run", "s")
     seed: int = described("of the runs")
-    generate_ms: float = described("to generate a run in memory", "ms")
-    write_s: float = described("to generate and write all of them as run folders", "s")
     points: tuple[Point, ...] = described("the measurements")
-    nonlinearity_ratio: float = described(
-        "largest deviation of the time a run from that of the largest size, same processes", "1"
-    )
-    cpu_nonlinearity_ratio: float = described(
-        "the same of processor time, which other work on the machine hardly changes", "1"
-    )
-    memory_growth_ratio: float = described(
-        "largest growth of the peak from the smallest to the largest size, same processes", "1"
-    )
     speed_up: dict[int, float] = described("by number of processes, times one at the largest size")
 
 
@@ -122,27 +109,6 @@ def write_generated(seed: int, folder: Path, number: int) -> None:
     write_run(generated_run(seed, number), folder)
 
 
-def loaders(folder: Path, n_runs: int) -> list[Any]:
-    """Return what reads the first of the runs that were written."""
-    from pipelines.data.datasets import RunLoader
-
-    return [
-        RunLoader(partial(read_run, folder / f"run_{number:06d}"), False, False, None)
-        for number in range(n_runs)
-    ]
-
-
-class Peak:
-    """The largest sum of resident memory that was sampled, in MB; shared pages count for each process."""
-
-    def __init__(self) -> None:
-        self.mb = 0.0
-
-    def sample(self) -> None:
-        """Take one sample."""
-        self.mb = max(self.mb, sum(_rss_mb(pid) for pid in process_tree(os.getpid())))
-
-
 def process_tree(pid: int) -> list[int]:
     """Return a process and all that it started, directly or through others; those that ended are left out."""
     found, pids = [], [pid]
@@ -157,18 +123,6 @@ def process_tree(pid: int) -> list[int]:
     return found
 
 
-def cpu_s() -> float:
-    """Return the processor time that this process and all that it started have taken so far."""
-    ticks = 0
-    for pid in process_tree(os.getpid()):
-        try:
-            after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-            ticks += int(after_name[11]) + int(after_name[12])
-        except (OSError, ValueError, IndexError):
-            continue
-    return ticks / os.sysconf("SC_CLK_TCK")
-
-
 def _rss_mb(pid: int) -> float:
     try:
         return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
@@ -177,23 +131,30 @@ def _rss_mb(pid: int) -> float:
 
 
 @contextmanager
-def peak_memory() -> Iterator[Peak]:
-    """Sample memory while a block lasts, from a thread of its own."""
-    peak, ended = Peak(), Event()
+def peak_memory() -> Iterator[list[float]]:
+    """Sample the sum of resident memory in MB while a block lasts, from a thread of its own.
+
+    It is that of this process and all that it started; shared pages count for each.
+    """
+    samples_mb: list[float] = []
+    ended = Event()
 
     def watch() -> None:
         while not ended.wait(EVERY_S):
-            peak.sample()
+            sample()
+
+    def sample() -> None:
+        samples_mb.append(sum(_rss_mb(pid) for pid in process_tree(os.getpid())))
 
     thread = Thread(target=watch, name="memory", daemon=True)
-    peak.sample()
+    sample()
     thread.start()
     try:
-        yield peak
+        yield samples_mb
     finally:
         ended.set()
         thread.join()
-        peak.sample()
+        sample()
 
 
 def run(settings: Settings, progress: Progress = silent) -> ScaleResult:
@@ -203,100 +164,53 @@ def run(settings: Settings, progress: Progress = silent) -> ScaleResult:
     from pipelines.learn.parallel import parallel
 
     sizes = sorted({max(round(fraction * settings.runs), 1) for fraction in FRACTIONS})
-    begun_s = perf_counter()
-    for number in range(N_GENERATED):
-        generated_run(settings.seed, number)
-    generate_ms = (perf_counter() - begun_s) * 1e3 / N_GENERATED
     with TemporaryDirectory(dir=settings.scratch, prefix="fleet-") as folder:
         runs = Path(folder) / "runs"
-        begun_s = perf_counter()
         numbers = [(number,) for number in range(sizes[-1])]
         given = write_generated, (settings.seed, runs), numbers, max(settings.workers)
         list(parallel(*given, "write runs", progress))
-        write_s = perf_counter() - begun_s
         points: list[Point] = []
         for n_workers in settings.workers:
-            get_reusable_executor().shutdown(
-                wait=True
-            )  # processes of the last size, with the memory they hold
+            # processes of the last size, with the memory they hold
+            get_reusable_executor().shutdown(wait=True)
             _measure(runs, min(WARM_RUNS, sizes[-1]), n_workers)
             for n_runs in sizes:
                 progress("measure", len(points), len(sizes) * len(settings.workers))
                 points.append(_measure(runs, n_runs, n_workers))
         progress("measure", len(points), len(points))
-    return ScaleResult(
-        run_s=RUN_S,
-        seed=settings.seed,
-        generate_ms=generate_ms,
-        write_s=write_s,
-        points=tuple(points),
-        nonlinearity_ratio=nonlinearity([(p.n_workers, p.n_runs, p.seconds) for p in points]),
-        cpu_nonlinearity_ratio=nonlinearity([(p.n_workers, p.n_runs, p.cpu_s) for p in points]),
-        memory_growth_ratio=memory_growth(points),
-        speed_up=speed_ups(points),
-    )
+    largest = {point.n_workers: point.seconds for point in points if point.n_runs == sizes[-1]}
+    times = {n: largest[1] / seconds for n, seconds in largest.items() if n > 1} if 1 in largest else {}
+    return ScaleResult(run_s=RUN_S, seed=settings.seed, points=tuple(points), speed_up=times)
 
 
 def _measure(runs: Path, n_runs: int, n_workers: int) -> Point:
+    from pipelines.data.datasets import RunLoader
     from pipelines.learn.cache import cached_data
     from pipelines.learn.settings import LearnSettings
 
-    with TemporaryDirectory(dir=runs.parent, prefix="store-") as out, peak_memory() as peak:
-        begun_s, begun_cpu_s = perf_counter(), cpu_s()
-        cached_data(loaders(runs, n_runs), LearnSettings(n_jobs=n_workers), Path(out))
-        seconds, used_s = perf_counter() - begun_s, cpu_s() - begun_cpu_s
-    return Point(n_runs, n_workers, seconds, n_runs / seconds, used_s, peak.mb)
-
-
-def _by_workers(points: Sequence[Point]) -> list[list[Point]]:
-    """Return the points of each number of processes, by size."""
-    numbers = sorted({point.n_workers for point in points})
-    return [sorted(point for point in points if point.n_workers == number) for number in numbers]
-
-
-def nonlinearity(times: Sequence[tuple[int, int, float]]) -> float:
-    """Return the largest deviation of the time a run from that of the largest size with as many processes.
-
-    The times are (processes, runs, time in s) of each measurement.
-    """
-    deviations = []
-    for n_workers in {each[0] for each in times}:
-        same = sorted((n_runs, time_s) for n, n_runs, time_s in times if n == n_workers)
-        of_largest_s = same[-1][1] / same[-1][0]
-        deviations += [abs(time_s / n_runs / of_largest_s - 1.0) for n_runs, time_s in same]
-    return float(np.max(deviations))
-
-
-def memory_growth(points: Sequence[Point]) -> float:
-    """Return the largest growth of the peak from the smallest to the largest size."""
-    return float(np.max([same[-1].peak_mb / same[0].peak_mb - 1.0 for same in _by_workers(points)]))
-
-
-def speed_ups(points: Sequence[Point]) -> dict[int, float]:
-    """Return by number of processes how many times faster than one they are, at the largest size."""
-    largest = {same[-1].n_workers: same[-1].seconds for same in _by_workers(points)}
-    return {n: largest[1] / seconds for n, seconds in largest.items() if n > 1} if 1 in largest else {}
+    folders = [runs / f"run_{number:06d}" for number in range(n_runs)]
+    loaders = [RunLoader(partial(read_run, each), False, False, None) for each in folders]
+    with TemporaryDirectory(dir=runs.parent, prefix="store-") as out, peak_memory() as samples_mb:
+        begun_s = perf_counter()
+        cached_data(loaders, LearnSettings(n_jobs=n_workers), Path(out))
+        seconds = perf_counter() - begun_s
+    return Point(n_runs, n_workers, seconds, n_runs / seconds, max(samples_mb))
 
 
 def report(result: ScaleResult) -> Report:
-    """Return time and memory by size and number of processes, and what follows from them."""
+    """Return time and memory by size and number of processes."""
     columns = (
-        *("runs", "processes", Column("time", ".1f", "s"), Column("runs/s", ".1f")),
-        *(Column("processor time", ".1f", "s"), Column("peak memory", ".0f", "MB")),
+        "runs",
+        "processes",
+        Column("time", ".1f", "s"),
+        Column("runs/s", ".1f"),
+        Column("peak", ".0f", "MB"),
     )
+    slowest, fastest = (f(point.runs_per_s for point in result.points) for f in (min, max))
+    times = [(f"{n} processes, times one", ratio, ".2f") for n, ratio in result.speed_up.items()]
     return Report(
         "Features of many runs",
-        f"Time a run deviates by at most {result.nonlinearity_ratio:.1%} from that of the largest size, processor time "
-        f"by {result.cpu_nonlinearity_ratio:.1%}; peak memory grows by {result.memory_growth_ratio:+.1%} from the "
-        "smallest to the largest size.",
-        parts=(
-            Table(columns, result.points),
-            Pairs(
-                (
-                    *((f"{n} processes, times one", times, ".2f") for n, times in result.speed_up.items()),
-                    (f"a run of {result.run_s:g} s generated in", result.generate_ms, ".1f", "ms"),
-                    ("all generated and written in", result.write_s, ".1f", "s"),
-                )
-            ),
-        ),
+        f"{slowest:.1f} to {fastest:.1f} runs of {result.run_s:g} s a second, with at most "
+        f"{max(point.peak_mb for point in result.points):.0f} MB.",
+        parts=(Table(columns, result.points), Pairs(times)) if times else (Table(columns, result.points),),
     )

@@ -8,21 +8,8 @@ import msgpack
 import numpy as np
 import pytest
 
-from pipelines.learn.model_file import read_model
 from studies import live, soak
-from studies.service import (
-    ROBOT,
-    ServiceProcess,
-    messages_of,
-    model_folder,
-    packed,
-    sent_channels,
-    service_process,
-    spread,
-    study_drive,
-)
-from terrain.errors import TerrainError
-from terrain.robots import load_robot
+from studies.service import messages_of, model_folder, packed, sent_channels, study_drive
 
 
 @pytest.fixture(scope="module")
@@ -33,11 +20,6 @@ def run():
 @pytest.fixture(scope="module")
 def uri(tmp_path_factory):
     return model_folder(None, 3, tmp_path_factory.mktemp("study") / "model")
-
-
-def test_the_spread_is_median_99th_percentile_and_largest():
-    assert spread(list(range(101))) == (50.0, 99.0, 100.0)
-    assert all(np.isnan(spread([])))
 
 
 def test_messages_hold_every_sample_of_the_drive_once(run):
@@ -53,40 +35,27 @@ def test_messages_hold_every_sample_of_the_drive_once(run):
 
 
 @pytest.mark.slow
-def test_steps_are_timed(run, uri):
-    robot, model = load_robot(ROBOT), read_model(uri)
-    alone, beside = live.step_times_us(robot, model, run, repeats=1)
-    assert 5.0 < alone.median <= alone.p99 <= alone.largest < 1e6
-    assert beside.median > 5.0
-    assert live.paced_step_times_us(robot, model, run, 0.5).median > 5.0
-
-
-@pytest.mark.slow
-def test_a_service_that_does_not_start_is_named():
-    with pytest.raises(TerrainError, match="the service did not start: error: /nowhere"):
-        ServiceProcess(["--model", "/nowhere"])
-
-
-@pytest.mark.slow
-def test_the_live_study_has_all_its_figures(uri):
-    result = live.run(live.Settings(model=uri, robots=3, seconds=3.0, seed=3))
+def test_the_live_study_has_all_its_figures(uri, monkeypatch):
+    monkeypatch.setattr(live, "REPEATS", 1)
+    monkeypatch.setattr(live, "N_WINDOWS", 40)
+    result = live.run(live.Settings(model=uri, robots=3, seconds=1.5, seed=3))
     document = result.as_json()
     json.dumps(document, allow_nan=False)
-    for name in ("step_us", "window_ms", "websocket_ms"):
+    for name in ("step_us", "step_beside_window_us", "step_paced_us", "window_ms", "websocket_ms"):
         assert 0.0 < document[name]["median"] <= document[name]["p99"]
-    assert (document["sessions"], document["lost_samples"]) == (3, 0)
     assert [row["sessions"] for row in document["by_sessions"]] == [2, 3, 5]
+    assert [row["lost_samples"] for row in document["by_sessions"]] == [0, 0, 0]
     assert 0.5 < document["start_s"] < 60.0
     assert 50.0 < document["rss_mb"] < 1000.0
     assert "3 robots" in result.report.answer
 
 
 @pytest.mark.slow
-def test_a_soak_of_half_a_minute_with_every_fault_is_accepted(uri, monkeypatch):
-    monkeypatch.setattr(soak, "FAULTS_PER_MINUTE", 120.0)
-    found = soak.run(soak.Settings(model=uri, robots=4, minutes=0.5, seed=5))
+def test_a_short_soak_with_every_fault_is_accepted(uri, monkeypatch):
+    monkeypatch.setattr(soak, "FAULTS_PER_MINUTE", 300.0)
+    found = soak.run(soak.Settings(model=uri, robots=4, minutes=0.2, seed=5))
     assert found.problems == ()
-    assert found.steps > 500
+    assert found.steps > 150
     assert sum(found.faults.values()) >= 20
     assert set(found.faults) <= set(soak.FAULTS)
 
@@ -153,11 +122,3 @@ def test_an_answer_is_that_of_its_request(monkeypatch, answers, steps, unanswere
     robot = soak._Robot(0, {"imu": ["gyro_z_radps"]}, [message], soak._Seen(), 0)
     asyncio.run(robot._answer(Socket(), 2.0, time.monotonic()))
     assert (robot._seen.steps, robot._seen.unanswered) == (steps, unanswered)
-
-
-@pytest.mark.slow
-def test_a_service_process_ends_in_order(uri):
-    with service_process(["--model", uri]) as service:
-        assert service.rss_mb > 50.0
-        assert service.figure("terrain_served_number") == 1.0
-    assert service.process.returncode == 0

@@ -5,16 +5,16 @@ import json
 import re
 import subprocess
 import sys
+import time
 from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from pipelines.report.results import Result
 from pipelines.report.tree import Report
-from studies import figures, intervals, labels, long_drives, mutants, scale, trials
+from studies import consistency, figures, intervals, labels, long_drives, mutants, scale, trials
 from studies.__main__ import STUDIES, main
 from studies.blind_trials.hidden import Row
 from terrain.errors import ConfigError, DataError
@@ -28,7 +28,7 @@ ROBOT = load_robot("agrimaro")
 def test_every_study_is_one_file_like_a_command(name):
     module = import_module(STUDIES[name][0])
     assert module.EXAMPLE.startswith(f"python tests/studies {name}")
-    assert issubclass(type(module.Settings), type)
+    assert isinstance(module.Settings, type)
     assert callable(module.run)
     assert callable(module.report)
     assert doctest.testmod(module, optionflags=doctest.NORMALIZE_WHITESPACE).failed == 0
@@ -95,7 +95,8 @@ def test_every_mutant_has_one_place_and_its_tests(mutant):
     assert all((ROOT / test.partition("::")[0]).exists() for test in mutant.tests)
 
 
-def test_a_mutant_is_caught_by_a_test_that_fails_and_the_tree_is_as_it_was(tmp_path):
+def test_a_mutant_is_caught_by_a_test_that_fails_and_the_tree_is_as_it_was(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")  # it starts three times as fast
     (tmp_path / "half.py").write_text("def half(x):\n    return x / 2\n")
     (tmp_path / "test_half.py").write_text("import half\n\ndef test_half():\n    assert half.half(4) == 2\n")
     (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = slow\npythonpath = .\n")
@@ -112,9 +113,9 @@ def test_a_mutant_is_caught_by_a_test_that_fails_and_the_tree_is_as_it_was(tmp_p
 
 @pytest.mark.slow
 def test_intervals_contain_the_true_peaks_of_learned_slip():
-    """Eight cases at 90 %: fewer than five inside is one time in two hundred."""
-    (row,) = intervals.run(intervals.Settings(repeats=8, seed=1400, uses="slip-peak")).rows
-    assert row.coverage >= 5 / 8
+    """Four cases at 90 %: fewer than two inside is less than one time in two hundred."""
+    (row,) = intervals.run(intervals.Settings(repeats=4, seed=1400, uses="slip-peak")).rows
+    assert row.coverage >= 2 / 4
     assert row.error_median < 0.03
 
 
@@ -122,6 +123,17 @@ def test_the_interval_of_a_probability_is_exact():
     assert intervals.clopper_pearson(0, 5) == (0.0, pytest.approx(1 - 0.025 ** (1 / 5)))
     assert intervals.clopper_pearson(5, 5)[0] == pytest.approx(0.025 ** (1 / 5))
     assert intervals.clopper_pearson(90, 100) == pytest.approx((0.824, 0.951), abs=1e-3)
+
+
+def test_consistency_has_a_mean_and_an_interval_of_every_group_on_every_terrain():
+    rows = consistency.consistency_by_terrain(ROBOT, 41, 1, terrains=("tiles", "tilled_loam"))
+    assert [row.terrain for row in rows] == ["tiles", "tilled_loam"]
+    for row in rows:
+        assert list(row.nees) == list(consistency.GROUPS)
+        assert row.n_runs == row.slip_coverage.n == len(consistency.SCENARIOS)
+        for value in (*row.nees.values(), row.slip_coverage):
+            assert value.ci[0] < value.mean < value.ci[1]
+        assert 0.3 < row.slip_coverage.mean <= 1.0
 
 
 @pytest.mark.slow
@@ -143,20 +155,7 @@ def test_a_drive_without_a_minute_before_the_loss_is_refused():
 @pytest.mark.slow
 def test_a_few_blind_trials_come_out_right(capsys, tmp_path):
     file = tmp_path / "trials.json"
-    words = [
-        "--n",
-        "2",
-        "--seed",
-        "1",
-        "--rows",
-        "none,strong",
-        "--runs",
-        "4",
-        "--jobs",
-        "1",
-        "--json",
-        str(file),
-    ]
+    words = f"--n 2 --seed 1 --rows none,strong --runs 4 --jobs 1 --json {file}".split()
     assert main(["trials", *words]) == 0
     assert "4 trials of 4 runs, seed 1" in capsys.readouterr().out
     found = json.loads(file.read_text())
@@ -167,18 +166,18 @@ def test_a_few_blind_trials_come_out_right(capsys, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("settings", "options", "message"),
     [
-        ({"rows": "none,weak"}, "--rows is 'none,weak'; some of none,strong,ladder,"),
-        ({"rows": ","}, "--rows is ''"),
-        ({"rows": "none,none"}, "each once"),
-        ({"n": 0}, "--n is 0: "),
-        ({"rows": "all"}, ",".join(Row)),
+        (trials.Settings, {"rows": "none,weak"}, "--rows is 'none,weak'; some of none,strong,ladder,"),
+        (trials.Settings, {"rows": ","}, "--rows is ''"),
+        (trials.Settings, {"rows": "none,none"}, "each once"),
+        (trials.Settings, {"rows": "all"}, ",".join(Row)),
+        *((scale.Settings, {"workers": workers}, "--workers is") for workers in ("0", "1,1", "", "x")),
     ],
 )
-def test_trials_that_are_not_accepted_are_one_sentence(options, message):
+def test_settings_that_are_not_accepted_are_one_sentence(settings, options, message):
     with pytest.raises(ConfigError, match=re.escape(message)):
-        trials.Settings(**options)
+        settings(**options)
 
 
 # -- scale -------------------------------------------------------------------------------------------------
@@ -194,32 +193,17 @@ def test_a_generated_run_depends_on_seed_and_number_only_and_has_the_colour_of_i
         assert np.corrcoef(gyro[1:], gyro[:-1])[0, 1] == pytest.approx(colour, abs=5 / np.sqrt(len(gyro)))
 
 
-def test_nonlinearity_growth_and_speed_up_are_of_points_that_share_the_rest():
-    assert scale.nonlinearity([(1, n, 0.01 * n) for n in (10, 30, 100)]) == pytest.approx(0.0)
-    assert scale.nonlinearity([(1, n, 0.01 * n**2) for n in (10, 100)]) == pytest.approx(0.9)
-    points = [
-        scale.Point(10, 1, 1.0, 10.0, 1.0, 100.0),
-        scale.Point(100, 1, 10.0, 10.0, 10.0, 110.0),
-        scale.Point(10, 2, 0.6, 16.7, 1.1, 300.0),
-        scale.Point(100, 2, 5.0, 20.0, 10.0, 300.0),
-    ]
-    assert scale.memory_growth(points) == pytest.approx(0.1)
-    assert scale.speed_ups(points) == {2: 2.0}
-    assert scale.speed_ups(points[2:]) == {}
-
-
 def test_memory_of_processes_that_were_started_counts():
     code = "block = bytearray(200_000_000); print(len(block), flush=True); input()"
-    with scale.peak_memory() as peak:
-        before_mb = peak.mb
-        child = subprocess.Popen(
-            [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
+    with scale.peak_memory() as samples_mb:
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        child = subprocess.Popen([sys.executable, "-c", code], **pipes)
         child.stdout.readline()
-        peak.sample()
-        assert child.pid in scale.process_tree(child.pid)
+        before, n = samples_mb[0], len(samples_mb)
+        while len(samples_mb) == n:
+            time.sleep(0.01)
         child.communicate("\n")
-    assert peak.mb - before_mb > 200.0
+    assert max(samples_mb) - before > 200.0
 
 
 @pytest.mark.slow
@@ -227,13 +211,8 @@ def test_few_runs_are_measured_and_nothing_is_left(tmp_path):
     result = scale.run(scale.Settings(runs=20, workers=(1,), scratch=tmp_path))
     assert [point.n_runs for point in result.points] == [2, 6, 20]
     assert all(point.seconds > 0 and point.peak_mb > 0 for point in result.points)
+    assert result.speed_up == {}
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("workers", ["0", "1,1", "", "x"])
-def test_workers_that_are_not_accepted_are_one_sentence(workers):
-    with pytest.raises(ConfigError, match="--workers is"):
-        scale.Settings(workers=workers)
 
 
 @pytest.mark.slow
@@ -250,11 +229,7 @@ def test_label_strategies_are_compared_on_held_out_runs(tmp_path):
     assert "points against as many drawn" in found.report.answer
 
 
-class _Refused(NamedTuple):
-    refused: str
-
-
-def test_what_is_not_accepted_is_exit_code_1(monkeypatch, tmp_path):
+def test_what_is_not_accepted_is_exit_code_1(monkeypatch):
     class Bad(Result):
         refused = "memory grew"
         report = Report("soak", "bad")
