@@ -8,11 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from sklearn.base import BaseEstimator, ClassifierMixin, clone
-from sklearn.feature_selection import SelectPercentile, VarianceThreshold, f_classif
-from sklearn.impute import SimpleImputer
+from sklearn.feature_selection import SelectPercentile, f_classif
 from sklearn.linear_model import LogisticRegression
-from sklearn.pipeline import Pipeline
-from sklearn.preprocessing import FunctionTransformer, StandardScaler
+from sklearn.preprocessing import StandardScaler
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
@@ -85,20 +83,24 @@ def f_score(X: Array, y: Array) -> tuple[Array, Array]:
 
 def fit_preparation(X: Array, y: Array, percentile: float) -> Preparation:
     """Return the preparation (of rows (n, f)) by a percentage of the features that vary: those an F test keeps."""
-    clip = FunctionTransformer(np.clip, kw_args={"a_min": -CLIP_STD, "a_max": CLIP_STD})
-    steps = Pipeline(
-        [
-            ("impute", SimpleImputer(strategy="median", keep_empty_features=True)),
-            ("constant", VarianceThreshold()),
-            ("scale", StandardScaler()),
-            ("clip", clip),
-            ("select", SelectPercentile(f_score, percentile=percentile)),
-        ]
-    ).fit(X, y)
-    selected = steps["select"].get_support()
-    columns = np.flatnonzero(steps["constant"].get_support())[selected]
-    fill = np.nan_to_num(steps["impute"].statistics_[columns])  # of a feature without any value
-    return Preparation(columns, fill, steps["scale"].mean_[selected], steps["scale"].scale_[selected])
+    fill, filled = filled_by_median(X, np.isfinite(X))
+    columns = np.flatnonzero(np.minimum(filled.var(axis=0), np.ptp(filled, axis=0)) > 0.0)
+    scaler = StandardScaler().fit(filled[:, columns])
+    every = Preparation(columns, fill[columns], scaler.mean_, scaler.scale_)
+    if percentile >= 100.0:
+        return every
+    kept = SelectPercentile(f_score, percentile=percentile).fit(every.of(X), y).get_support()
+    return Preparation(*(each[kept] for each in every))
+
+
+def filled_by_median(X: Array, known: Array) -> tuple[Array, Array]:
+    """Return the median (f,) of the known values of each feature, 0 without any, and rows (n, f) filled with it."""
+    fill = np.zeros(X.shape[1])
+    whole, some = known.all(axis=0), known.any(axis=0)
+    fill[whole] = np.median(X[:, whole], axis=0)  # much faster than what has to leave values out
+    for column in np.flatnonzero(some & ~whole):
+        fill[column] = np.median(X[known[:, column], column])
+    return fill, np.where(known, X, fill)
 
 
 @dataclass(eq=False, repr=False)

@@ -204,13 +204,9 @@ def _fitted(X: Array, y: Array) -> Novelty:
     from sklearn.covariance import ledoit_wolf
     from sklearn.svm import SVC
 
-    from terrain.classify.grouped import f_score
+    from terrain.classify.grouped import f_score, filled_by_median
 
-    valid = np.isfinite(X)
-    some = valid.any(axis=0)
-    fill = np.zeros(X.shape[1])
-    fill[some] = np.nanmedian(np.where(valid, X, np.nan)[:, some], axis=0)
-    filled = np.where(valid, X, fill)
+    fill, filled = filled_by_median(X, np.isfinite(X))
     mean, scale = filled.mean(axis=0), filled.std(axis=0)
     columns = np.flatnonzero(scale > 1e-12 * np.abs(mean))
     if not len(columns):

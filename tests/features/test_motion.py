@@ -21,29 +21,23 @@ def values():
     return {"imu": RNG.normal(0, 0.3, (20, 1, 10)), "wheels": RNG.normal(0.1, 0.3, (20, 3, 10))}
 
 
-def test_left_and_right_forward_and_back_are_one_motion(values):
+def test_a_mirror_a_direction_currents_and_vibration_change_no_motion(values):
+    imu, speeds = values["imu"], values["wheels"]
     motion = window_motion(windows_of(values))
-    mirrored = {"imu": -values["imu"], "wheels": values["wheels"][:, [1, 0, 2]]}
-    back = {"imu": values["imu"], "wheels": -values["wheels"]}
-    for other in (mirrored, back):
+    for other in (
+        {"imu": -imu, "wheels": speeds[:, [1, 0, 2]]},
+        {"imu": imu, "wheels": -speeds},
+        {"imu": imu + np.tile([1.0, -1.0], 5), "wheels": speeds * [[1], [1], [7]]},
+    ):
         for found, expected in zip(window_motion(windows_of(other)), motion, strict=True):
             np.testing.assert_allclose(found, expected)
-
-
-def test_currents_and_vibration_change_nothing(values):
-    motion = window_motion(windows_of(values))
-    shaken = {"imu": values["imu"] + np.tile([1.0, -1.0], 5), "wheels": values["wheels"] * [[1], [1], [7]]}
-    for found, expected in zip(window_motion(windows_of(shaken)), motion, strict=True):
-        np.testing.assert_allclose(found, expected)
-
-
-def test_what_is_not_measured_is_nan_and_without_wheels_there_is_no_motion(values):
+    # What is not measured is NaN, and without wheels there is no motion.
     wheels = {"wheels": ("speed_1_mps", "speed_2_mps", "speed_3_mps")}
-    motion = window_motion(windows_of({"wheels": values["wheels"]}, wheels))
-    np.testing.assert_allclose(motion.speed_mps, np.abs(values["wheels"]).mean(axis=2).max(axis=1))
+    motion = window_motion(windows_of({"wheels": speeds}, wheels))
+    np.testing.assert_allclose(motion.speed_mps, np.abs(speeds).mean(axis=2).max(axis=1))
     assert np.isnan(motion.yaw_rate_radps).all()
     assert np.isnan(motion.turn_ratio).all()
-    assert window_motion(windows_of({"imu": values["imu"]}, {"imu": ("gyro_z_radps",)})) is None
+    assert window_motion(windows_of({"imu": imu}, {"imu": ("gyro_z_radps",)})) is None
 
 
 def test_a_stretch_of_another_vibration_is_found_and_a_plain_run_has_none(drive):

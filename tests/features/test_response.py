@@ -3,6 +3,7 @@ import pytest
 
 from features.response import ResponseExtractor
 from terrain.errors import DataError
+from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Windows
 
 NAMES = ("speed_1_mps", "speed_2_mps", "current_1_a", "current_2_a")
@@ -12,29 +13,18 @@ def windows_of(values, names=NAMES, **more):
     streams = {"wheels": np.asarray(values, dtype=float), **more}
     channels = {"wheels": names, "slip": ("slip_1_ratio", "slip_2_ratio")}
     n = len(streams["wheels"])
+    of_streams = {name: channels[name] for name in streams}, dict.fromkeys(streams, 4.0)
     return Windows(
-        streams,
-        {name: channels[name] for name in streams},
-        dict.fromkeys(streams, 4.0),
-        2.0,
-        np.arange(float(n)),
-        np.array(["a"] * n),
-        np.array(["cork"] * n),
+        streams, *of_streams, 2.0, np.arange(float(n)), np.array(["a"] * n), np.array(["cork"] * n)
     )
 
 
-def test_samples_before_the_wheels_turn_are_left_out_of_the_means():
+def test_means_leave_out_what_stands_and_a_signed_current_is_positive_where_it_drives():
     speed, current = np.full(8, 0.2), np.full(8, 3.0)
-    speed[:2], current[:2] = 0.0, 9.0
-    found = ResponseExtractor().fit_transform(windows_of([[speed, -speed, current, current + 1.0]]))
-    np.testing.assert_allclose(found, [[0.2, -0.2, 3.0, 4.0]])
-
-
-def test_a_current_with_a_sign_is_that_of_a_magnitude_where_it_drives():
-    speed = np.full(8, 0.2)
-    signed = windows_of([[speed, -speed, np.full(8, 3.0), np.full(8, -4.0)]])
-    magnitude = windows_of([[speed, -speed, np.full(8, 3.0), np.full(8, 4.0)]])
-    np.testing.assert_allclose(*(ResponseExtractor().fit_transform(each) for each in (signed, magnitude)))
+    speed[:2], current[:2] = 0.0, 9.0  # the wheels do not turn yet
+    for signed in (current + 1.0, -current - 1.0):
+        found = ResponseExtractor().fit_transform(windows_of([[speed, -speed, current, signed]]))
+        np.testing.assert_allclose(found, [[0.2, -0.2, 3.0, 4.0]])
 
 
 def test_slip_is_a_response_positive_in_traction_and_may_be_missing():
@@ -51,9 +41,10 @@ def test_slip_is_a_response_positive_in_traction_and_may_be_missing():
 
 def test_windows_without_responses_or_wheels_are_refused():
     speed = np.full((1, 2, 8), 0.2)
-    with pytest.raises(DataError, match="no response of each wheel"):
-        ResponseExtractor().fit(windows_of(speed, NAMES[:2]))
-    with pytest.raises(DataError, match="no response of each wheel"):
-        ResponseExtractor(("wheels", "slip")).fit(windows_of(np.tile(speed, (1, 2, 1))))
-    with pytest.raises(DataError, match="at the speeds of the wheels"):
-        ResponseExtractor().fit(windows_of(speed, NAMES[2:]))
+    for sets, windows, sentence in (
+        (SIGNAL_SETS, windows_of(speed, NAMES[:2]), "no response of each wheel"),
+        (("wheels", "slip"), windows_of(np.tile(speed, (1, 2, 1))), "no response of each wheel"),
+        (SIGNAL_SETS, windows_of(speed, NAMES[2:]), "at the speeds of the wheels"),
+    ):
+        with pytest.raises(DataError, match=sentence):
+            ResponseExtractor(sets).fit(windows)

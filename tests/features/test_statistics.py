@@ -32,11 +32,9 @@ def table(values, rate_hz=RATE_HZ):
 
 def by_numpy(x):
     """Return what each statistic of one channel in one window is defined to be."""
-    x = x.astype(float)
-    d = x - x.mean()
-    q05, q25, median, q75, q95 = np.quantile(x, [0.05, 0.25, 0.5, 0.75, 0.95])
-    steps = np.abs(np.diff(x)).mean()
-    expected = {
+    d, steps = x - x.mean(), np.abs(np.diff(x)).mean()
+    levels = ("q05", 0.05), ("q25", 0.25), ("median", 0.5), ("q75", 0.75), ("q95", 0.95)
+    expected = {name: np.quantile(x, level) for name, level in levels} | {
         "mean": x.mean(),
         "std": x.std(),
         "log_std": np.log10(x.std() + 1e-4),
@@ -44,11 +42,6 @@ def by_numpy(x):
         "kurtosis": stats.kurtosis(x),
         "min": x.min(),
         "max": x.max(),
-        "q05": q05,
-        "q25": q25,
-        "median": median,
-        "q75": q75,
-        "q95": q95,
         "iqr": stats.iqr(x),
         "rms": np.sqrt(np.mean(x**2)),
         "mean_abs": np.abs(x).mean(),
@@ -64,17 +57,17 @@ def by_numpy(x):
 
 def draw_values(seed, n_samples):
     rng = np.random.default_rng(seed)
-    scale = 10.0 ** rng.uniform(-2, 3, (3, 2, 1))
-    values = rng.standard_t(4, (3, 2, n_samples)).cumsum(axis=2) * scale
-    return values + scale * rng.uniform(-3, 3, (3, 2, 1))
+    scale = 10.0 ** rng.uniform(-2, 3, (2, 2, 1))
+    values = rng.standard_t(4, (2, 2, n_samples)).cumsum(axis=2) * scale
+    return values + scale * rng.uniform(-3, 3, (2, 2, 1))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=25)
 @given(seeds, st.integers(4, 220))
 def test_kernel_agrees_with_numpy_and_scipy(seed, n_samples):
     values = draw_values(seed, n_samples)
     found = table(values)
-    for i, c in np.ndindex(3, 2):
+    for i, c in np.ndindex(2, 2):
         for name, expected in by_numpy(values[i, c]).items():
             assert found[name][i, c] == pytest.approx(expected, rel=1e-9, abs=1e-9), name
 
@@ -89,7 +82,7 @@ def test_a_constant_channel_has_no_shape_features(level):
         assert found[name][0, 0] == pytest.approx(expected, abs=1e-9), name
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(seeds, st.integers(2, 7), st.integers(4, 100))
 def test_correlations_agree_with_numpy_and_ignore_scale_and_bias(seed, n_channels, n_samples):
     rng = np.random.default_rng(seed)
@@ -102,41 +95,22 @@ def test_correlations_agree_with_numpy_and_ignore_scale_and_bias(seed, n_channel
     np.testing.assert_allclose(channel_correlations(scale * values + bias), expected, atol=1e-10)
 
 
-FLOOR = 1e-10
-
-
-def spectra(values, rate_hz):
-    """Return the band powers (n_windows, n_channels, bands) and the moments by name."""
-    found = channel_spectra(values, rate_hz)
-    bands = n_bands(values.shape[2])
-    moments = np.moveaxis(found[:, :, bands:], 2, 0)
-    return found[:, :, :bands], dict(zip([name for name, _ in MOMENTS], moments, strict=True))
-
-
-def noise(seed, n_samples, shape=(4, 2)):
-    rng = np.random.default_rng(seed)
-    white = rng.standard_normal((*shape, n_samples))
-    # Loud, so that the floor under the logarithms is far away.
-    return signal.lfilter([1e3], [1.0, -rng.uniform(-0.9, 0.9)], white, axis=2)
-
-
-def density(values, rate_hz):
-    """Return the one-sided periodogram by scipy: frequencies and densities without the line at 0 Hz."""
-    n = values.shape[2]
-    taper = np.sin(np.pi * (np.arange(n) + 0.5) / n) ** 2
-    frequency_hz, power = signal.periodogram(values, rate_hz, window=taper, detrend="constant", axis=2)
-    return frequency_hz[1:], power[:, :, 1:]
-
-
-@settings(deadline=None, max_examples=30)
-@given(st.integers(0, 2**32 - 1), st.integers(48, 220), st.floats(10.0, 500.0))
+@settings(max_examples=30)
+@given(seeds, st.integers(48, 220), st.floats(10.0, 500.0))
 def test_spectrum_agrees_with_scipy_and_its_definitions(seed, n_samples, rate_hz):
-    values = noise(seed, n_samples)
-    bands, moments = spectra(values, rate_hz)
-    f, p = density(values, rate_hz)
-    edges = np.linspace(0, f.size, n_bands(n_samples) + 1).round().astype(int)
+    """By the one-sided periodogram of scipy, without the line at 0 Hz."""
+    rng = np.random.default_rng(seed)
+    white = rng.standard_normal((4, 2, n_samples))
+    # Loud, so that the floor under the logarithms, of 1e-10, is far away.
+    values = signal.lfilter([1e3], [1.0, -rng.uniform(-0.9, 0.9)], white, axis=2)
+    found, bands = channel_spectra(values, rate_hz), n_bands(n_samples)
+    moments = dict(zip([name for name, _ in MOMENTS], np.moveaxis(found[:, :, bands:], 2, 0), strict=True))
+    taper = np.sin(np.pi * (np.arange(n_samples) + 0.5) / n_samples) ** 2
+    f, p = signal.periodogram(values, rate_hz, window=taper, detrend="constant", axis=2)
+    f, p = f[1:], p[:, :, 1:]
+    edges = np.linspace(0, f.size, bands + 1).round().astype(int)
     expected = [p[:, :, a:b].mean(axis=2) for a, b in pairwise(edges)]
-    np.testing.assert_allclose(10.0**bands, np.stack(expected, axis=2) + FLOOR, rtol=1e-9)
+    np.testing.assert_allclose(10.0 ** found[:, :, :bands], np.stack(expected, axis=2) + 1e-10, rtol=1e-9)
     weight = p / p.sum(axis=2, keepdims=True)
     centroid = np.sum(weight * f, axis=2)
     away = f - centroid[:, :, None]
@@ -163,8 +137,7 @@ def test_statistics_of_slip_are_those_of_the_samples_that_are_known():
     np.testing.assert_allclose(slip_statistics(slip)[1, 1], expected)
 
 
-@pytest.mark.parametrize("unknown", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("n_unknown", [19, 20, 21, 40])
+@pytest.mark.parametrize(("n_unknown", "unknown"), [(20, np.inf), (20, np.nan), (21, -np.inf), (40, np.nan)])
 def test_with_over_half_unknown_the_slip_is_not_known_rather_than_zero(n_unknown, unknown):
     slip = np.random.default_rng(0).normal(0.1, 0.2, (5, 2, 40))
     slip[0, 1, :n_unknown] = unknown

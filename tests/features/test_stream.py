@@ -74,7 +74,7 @@ def logs(draw):
     return RunLog("a", "husky", streams), rule, layout
 
 
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=60)
 @given(logs())
 def test_sample_by_sample_gives_the_very_windows_and_drops_of_the_whole_log(case):
     run, rule, layout = case
@@ -105,21 +105,14 @@ LAYOUT = Layout({name: CHANNELS[name] for name in STREAMS}, {"imu": 50.0, "wheel
 RULE = WindowRule(2.0, 0.5)
 
 
-def test_a_window_comes_with_the_last_sample_it_needs():
-    stream = WindowStream(RULE, LAYOUT)
+def test_a_window_comes_with_its_last_sample_and_each_bad_stamp_costs_only_its_sample():
+    stream, batch = WindowStream(RULE, LAYOUT), cut_windows([RunLog("a", "husky", STREAMS)], RULE)
     for name, time_s, row in merged(STREAMS):
         for window in stream.push(name, time_s, row):
             assert time_s - window.start_s[0] == pytest.approx(1.98)
-
-
-def test_streams_may_arrive_out_of_order_among_themselves():
-    batch = cut_windows([RunLog("a", "husky", STREAMS)], RULE)
+    # Streams may arrive out of order among themselves.
     lagging = sorted(merged(STREAMS), key=lambda event: event[1] + 3.0 * (event[0] == "wheels"))
     assert_same(batch.windows, streamed(lagging, RULE, LAYOUT)[1])
-
-
-def test_each_bad_stamp_costs_only_its_sample():
-    batch = cut_windows([RunLog("a", "husky", STREAMS)], RULE)
     events = merged(STREAMS)
     bad = [np.nan, np.inf, -np.inf, -1.0, 5.0, 1e300, 1e9]
     for i, time_s in enumerate(bad):  # the last two come one after the other: a wrong stamp confirms no other
@@ -136,38 +129,35 @@ def test_each_bad_stamp_costs_only_its_sample():
 
 
 def test_a_silent_stream_costs_windows_but_no_memory():
-    streams = steady_log(400.0)
-    silence = [event for event in merged(streams) if event[0] != "wheels" or not 30 < event[1] < 300]
+    streams = steady_log(150.0)
+    silence = [event for event in merged(streams) if event[0] != "wheels" or not 10 < event[1] < 120]
     stream, found, longest = WindowStream(RULE, LAYOUT), [], 0
     for name, time_s, row in silence:
         found += stream.push(name, time_s, row)
         longest = max(longest, *(len(buffer.time_s) for buffer in stream._buffers.values()))
-    assert longest < 2000
+    assert longest < 2000  # of 5,500 in the silence
     wheels = streams["wheels"]
-    there = (wheels.time_s <= 30) | (wheels.time_s >= 300)
+    there = (wheels.time_s <= 10) | (wheels.time_s >= 120)
     cut = Stream(wheels.time_s[there], wheels.values[there], wheels.channels)
     batch = cut_windows([RunLog("a", "husky", streams | {"wheels": cut})], RULE, layout=LAYOUT)
     assert_same(batch.windows, found)
     assert dict(stream.dropped) == batch.dropped
-
-
-def test_a_stream_that_begins_late_or_never_piles_nothing_up():
+    # Nor does one that has not begun yet pile anything up.
     stream = WindowStream(RULE, LAYOUT)
-    for i in range(100_000):
+    for i in range(10_000):
         assert not stream.push("imu", i / 50, (0.0, 0.0))
     assert len(stream._buffers["imu"].time_s) < 2000
-    events = [(name, time_s + 2000.0, row) for name, time_s, row in merged(STREAMS)]
+    events = [(name, time_s + 200.0, row) for name, time_s, row in merged(STREAMS)]
     found = [window for event in events for window in stream.push(*event)]
-    assert [float(window.start_s[0]) for window in found] == np.arange(2000, 2018.5, 0.5).tolist()
+    assert [float(window.start_s[0]) for window in found] == np.arange(200, 218.5, 0.5).tolist()
 
 
 def test_faults_of_the_programmer_are_raised():
     stream = WindowStream(RULE, LAYOUT)
     with pytest.raises(ConfigError, match="no stream 'lidar' in the layout; it has imu, wheels"):
         stream.push("lidar", 0.0, [1.0])
-    for values in ([1.0], [1.0, 2.0, 3.0], []):
-        with pytest.raises(ValueError, match=f"'imu' has 2 channels; the sample has {len(values)} values"):
-            stream.push("imu", 0.0, values)
+    with pytest.raises(ValueError, match="'imu' has 2 channels; the sample has 3 values"):
+        stream.push("imu", 0.0, [1.0, 2.0, 3.0])
     with pytest.raises(ConfigError, match=r"a step of 6 s is no gap; less than 5 s is accepted"):
         WindowStream(WindowRule(20.0), Layout({"wheels": CHANNELS["wheels"]}, {"wheels": 0.3}))
     with pytest.raises(DataError, match="without wheel speeds"):

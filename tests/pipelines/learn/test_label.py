@@ -98,39 +98,26 @@ def test_places_without_runs_and_two_runs_of_one_id_are_refused(folder, tmp_path
         labelled(folder, whole=True, terrain="ICE")
 
 
-@pytest.fixture
-def unlabelled(tmp_path, drive):
-    """Three runs of known ground without a label, and one with."""
+@pytest.fixture(scope="module")
+def proposed(tmp_path_factory, drive, tracked):
+    """What a model proposes for three runs of known ground without a label and one with, two questions first."""
+    place = tmp_path_factory.mktemp("proposed")
     for number, name in enumerate(("ASPHALT", "GRASS", "GRAVEL")):
-        write_run(drive(f"new_{name}", name, 60 + number, label=None), tmp_path / "data")
-    write_run(drive("old", "GRASS", 70), tmp_path / "data")
-    return tmp_path / "data"
-
-
-@pytest.fixture
-def proposed(unlabelled, tracked, tmp_path):
-    """What a model proposes for them, two questions first."""
-    table = tmp_path / "proposals.csv"
-    return label(Settings(data=unlabelled, model=str(tracked[0] / "model"), ask=2, proposals=table))
+        write_run(drive(f"new_{name}", name, 60 + number, label=None), place / "data")
+    write_run(drive("old", "GRASS", 70), place / "data")
+    asked = {"model": str(tracked[0] / "model"), "ask": 2, "proposals": place / "proposals.csv"}
+    return label(Settings(data=place / "data", **asked))
 
 
 def rows_of(file):
     return pd.read_csv(file, dtype=str, keep_default_na=False).to_dict("records")
 
 
-def changed(file, change):
-    """Put other rows, or a text, in place of those of a table."""
-    made = change(rows_of(file))
-    file.write_text(made if isinstance(made, str) else pd.DataFrame(made).to_csv(index=False))
-    return file
-
-
-def answered(proposed, out, accept=1.01, *, new_class=False, **answers):
-    """Take answers by the id of a run."""
-    table = changed(
-        proposed.file, lambda rows: [row | {"answer": answers.get(row["run_id"], "")} for row in rows]
-    )
-    return label(Settings(data=proposed.data, answers=table, out=out, accept=accept, new_class=new_class))
+def answered(proposed, place, rows, accept=1.01, **options):
+    """Take answers that are rows of a table, or a text."""
+    table = place / "answers.csv"
+    table.write_text(rows if isinstance(rows, str) else pd.DataFrame(rows).to_csv(index=False))
+    return label(Settings(data=proposed.data, answers=table, out=place / "out", accept=accept, **options))
 
 
 def test_proposals_cover_the_runs_and_questions_come_first(proposed):
@@ -150,7 +137,8 @@ def test_proposals_cover_the_runs_and_questions_come_first(proposed):
 
 def test_answers_stand_above_what_the_model_proposes_and_measured_labels_stay(proposed, tmp_path):
     answers = {"new_ASPHALT": "LAVA", "new_GRASS": "none", "new_GRAVEL": "yes"}
-    found = answered(proposed, tmp_path / "out", new_class=True, **answers)
+    rows = [row | {"answer": answers.get(row["run_id"], "")} for row in rows_of(proposed.file)]
+    found = answered(proposed, tmp_path, rows, new_class=True)
     runs, before = ({run.run_id: run for run in load_runs(at)} for at in (found.out, proposed.data))
     assert {label.terrain for label in runs["new_ASPHALT"].labels} == {"LAVA"}
     assert runs["new_GRASS"].labels == before["new_GRAVEL"].labels == ()  # what was recorded is as it was
@@ -163,44 +151,36 @@ def test_answers_stand_above_what_the_model_proposes_and_measured_labels_stay(pr
 
 
 def test_what_the_model_is_certain_of_needs_no_answer(proposed, tmp_path):
-    found = answered(proposed, tmp_path / "out", accept=0.0)
+    found = answered(proposed, tmp_path, rows_of(proposed.file), accept=0.0)
     of_model = [each for labels in found.runs.values() for each in labels if each.source == "model"]
     assert len(of_model) == found.n_labels["model"] >= 1
     assert all(0 < each.confidence <= 1 for each in of_model)
     assert not any(each.source == "model" for each in found.runs["old"])  # it is labelled already
 
 
-@pytest.mark.parametrize(
-    ("change", "error", "sentence"),
-    [
-        (lambda rows: rows, ConfigError, "nothing is written"),
-        (lambda rows: [row | {"run_id": "other"} for row in rows], ConfigError, "none of those"),
-        (lambda rows: [*rows, rows[0]], ConfigError, "overlap"),
-        (lambda rows: [rows[0] | {"answer": "LAVA"}], ConfigError, "--new-class"),
-        (lambda rows: [rows[0] | {"end_s": "900"}], ConfigError, "no stretch of run"),
-        (lambda rows: [rows[0] | {"start_s": "nan"}], LogError, "line 2: is no proposal .start_s is 'nan'"),
-        (lambda rows: [rows[0] | {"n_windows": "many"}], LogError, "line 2: is no proposal .n_windows is"),
-        (
-            lambda rows: f"{','.join(rows[0])}\nold,0\n",
-            LogError,
-            "line 2: is no proposal: it is longer or sh",
-        ),
-        (lambda rows: "a,b\n1,2\n", LogError, "column 'run_id' is missing"),
-    ],
-)
-def test_a_table_that_does_not_fit_is_refused_in_one_sentence(proposed, tmp_path, change, error, sentence):
-    changed(proposed.file, change)
-    with pytest.raises(error, match=sentence) as refusal:
-        label(Settings(data=proposed.data, answers=proposed.file, out=tmp_path / "out", accept=1.01))
-    assert len(str(refusal.value).splitlines()) == 1
-    assert not (tmp_path / "out").exists()
-
-
-def test_files_that_are_not_there_and_folders_that_are_are_refused(proposed, tmp_path, tracked, drive):
+def test_a_table_that_does_not_fit_is_refused_in_one_sentence(proposed, tmp_path, tracked, drive):
+    first, *others = rows = rows_of(proposed.file)
+    no_proposal = "line 2: is no proposal"
+    for other, error, sentence in (
+        (rows, ConfigError, "nothing is written"),
+        ([row | {"run_id": "other"} for row in rows], ConfigError, "none of those"),
+        ([first, *others, first], ConfigError, "overlap"),
+        ([first | {"answer": "LAVA"}], ConfigError, "--new-class"),
+        ([first | {"end_s": "900"}], ConfigError, "no stretch of run"),
+        ([first | {"start_s": "nan"}], LogError, f"{no_proposal} .start_s is 'nan'"),
+        ([first | {"n_windows": "many"}], LogError, f"{no_proposal} .n_windows is"),
+        (f"{','.join(first)}\nold,0\n", LogError, f"{no_proposal}: it is longer or sh"),
+        ("a,b\n1,2\n", LogError, "column 'run_id' is missing"),
+    ):
+        with pytest.raises(error, match=sentence) as refusal:
+            answered(proposed, tmp_path, other)
+        assert len(str(refusal.value).splitlines()) == 1
+        assert not (tmp_path / "out").exists()
     with pytest.raises(LogError, match="cannot be opened"):
         label(Settings(data=proposed.data, answers=tmp_path / "nowhere.csv", out=tmp_path / "out"))
+    (tmp_path / "out").mkdir()
     with pytest.raises(ConfigError, match="exists already"):
-        answered(proposed, proposed.data)
+        answered(proposed, tmp_path, rows)
     write_run(drive("short", "GRASS", 3, duration_s=1.5), tmp_path / "short")
     with pytest.raises(DataError, match="no run holds a window"):
         label(Settings(data=tmp_path / "short", model=str(tracked[0] / "model")))

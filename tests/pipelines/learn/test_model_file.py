@@ -46,13 +46,14 @@ def test_a_saved_model_predicts_the_same_to_the_last_bit(model_dir, windows, mod
     assert set(skops_io().get_untrusted_types(file=model_dir / MODEL_FILE)) <= set(TRUSTED_TYPES)
 
 
-@pytest.mark.parametrize("place", [0.0, 0.5, 0.999])
-def test_one_flipped_bit_anywhere_is_seen(model_dir, place):
-    content = bytearray((model_dir / MODEL_FILE).read_bytes())
-    content[int(place * len(content))] ^= 1
-    (model_dir / MODEL_FILE).write_bytes(content)
-    with pytest.raises(ModelError, match=r"model\.skops: is damaged \(SHA-256 .* expected\)"):
-        read_model(model_dir)
+def test_one_flipped_bit_anywhere_is_seen(model_dir):
+    whole = (model_dir / MODEL_FILE).read_bytes()
+    for place in (0, len(whole) // 2, len(whole) - 1):
+        content = bytearray(whole)
+        content[place] ^= 1
+        (model_dir / MODEL_FILE).write_bytes(content)
+        with pytest.raises(ModelError, match=r"model\.skops: is damaged \(SHA-256 .* expected\)"):
+            read_model(model_dir)
 
 
 def archive(members):
@@ -113,71 +114,59 @@ def recipe(first):
     return skops_io().dumps(WindowPipeline([("first", first), ("last", OTHER)]))
 
 
-@pytest.mark.parametrize(
-    ("content", "sentence"),
-    [
-        (lambda: skops_io().dumps(OTHER), "holds a LogisticRegression, not a recipe of this package"),
-        (lambda: skops_io().dumps({"recipe": 3, "novelty": OTHER}), "holds a int, not a recipe"),
-        (lambda: skops_io().dumps(make_recipe("svm")), "holds a recipe that was never fitted"),
-        (lambda: recipe(StandardScaler()), "holds a recipe that was never fitted"),
-        (
-            lambda: recipe(FunctionTransformer(os.mkdir, kw_args={"path": CALLED})),
-            r"holds posix\.mkdir, a type that models of this package do not hold",
-        ),
-        (lambda: pickle.dumps(Bomb()), "cannot be loaded"),
-        (pickled_array, "cannot be loaded"),
-        (lambda: archive({f"{number}.bin": b" " * (1 << 20) for number in range(17)}), "unpacks to"),
-        (lambda: archive({"schema.json": b"[" * 100_000}), "cannot be loaded"),
-    ],
-)
-def test_what_is_no_model_of_this_package_is_named_and_never_called(
-    model_dir, put, tmp_path, monkeypatch, content, sentence
-):
+def test_what_is_no_model_of_this_package_is_named_and_never_called(model_dir, put, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("pipelines.learn.model_file.MAX_UNPACKED_BYTES", 1 << 24)
-    put(content())
-    with pytest.raises(ModelError, match=sentence):
-        read_model(model_dir)
-    assert not (tmp_path / CALLED).exists()
+    calls = recipe(FunctionTransformer(os.mkdir, kw_args={"path": CALLED}))
+    for content, sentence in (
+        (skops_io().dumps(OTHER), "holds a LogisticRegression, not a recipe of this package"),
+        (skops_io().dumps({"recipe": 3, "novelty": OTHER}), "holds a int, not a recipe"),
+        (skops_io().dumps(make_recipe("svm")), "holds a recipe that was never fitted"),
+        (recipe(StandardScaler()), "holds a recipe that was never fitted"),
+        (calls, r"holds posix\.mkdir, a type that models of this package do not hold"),
+        (pickle.dumps(Bomb()), "cannot be loaded"),
+        (pickled_array(), "cannot be loaded"),
+        (archive({f"{number}.bin": b" " * (1 << 20) for number in range(17)}), "unpacks to"),
+        (archive({"schema.json": b"[" * 100_000}), "cannot be loaded"),
+    ):
+        put(content)
+        with pytest.raises(ModelError, match=sentence):
+            read_model(model_dir)
+        assert not (tmp_path / CALLED).exists()
     pickle.loads(pickle.dumps(Bomb()))
     assert (tmp_path / CALLED).exists()  # the test can fail
 
 
-def changed(document, **info):
-    return json.dumps(document | {"info": document["info"] | info})
-
-
-@pytest.mark.parametrize(
-    ("change", "fault"),
-    [
-        (lambda it: "{", "is damaged"),
-        (lambda it: "[]", "is damaged"),
-        (lambda it: json.dumps({"version": 6, "info": it["info"]}), r"is damaged \(files: Field required\)"),
-        (lambda it: json.dumps(it | {"version": 99}), "has version 99; version 6 is read here"),
-        (lambda it: json.dumps(it | {"version": ["x"] * 10**5}), "has version"),
-        (lambda it: json.dumps(it | {"files": {}}), "its list of files is not that of a model"),
-        (lambda it: json.dumps(it | {"files": {**it["files"], "../x": "a"}}), "its list of files is not"),
-        (lambda it: json.dumps(it | {"files": {MODEL_FILE: "5"}}), r"is damaged \(SHA-256"),
-        (lambda it: changed(it, window_s="two"), "is damaged"),
-        (lambda it: changed(it, classes=["grass", 3]), r"info\.classes\.1: Input should be a valid string"),
-        (lambda it: changed(it, classes="grass"), "info.classes: Input should be a valid"),
-        (lambda it: changed(it, classes=["ice", "mud", "sand"]), "its classes are not those of the manifest"),
-        (lambda it: changed(it, window_s=-2.0), r"is damaged \(window length_s is -2\.0"),
-        (lambda it: changed(it, window_s=10**400), "more than 64 bits"),
-        (lambda it: changed(it, window_s=float("nan")), "holds NaN, finite numbers"),
-        (lambda it: changed(it, steady={"a\nb": 1}), "is damaged"),
-        (lambda it: changed(it, rate_hz=dict.fromkeys(it["info"]["rate_hz"], 1e308)), "is damaged"),
-        (lambda it: changed(it, channels={"imu": ["gyro_x_radps"]}), "cannot be loaded"),
-        (lambda it: "[" * 100_000, r"is damaged \(is nested deeper than 32 levels\)"),
-    ],
-)
-def test_a_manifest_of_a_stranger_is_one_sentence(model_dir, change, fault):
+def test_a_manifest_of_a_stranger_is_one_sentence(model_dir):
     file = model_dir / MANIFEST_FILE
-    file.write_text(change(json.loads(file.read_text())))
-    with pytest.raises(ModelError, match=fault) as error:
-        read_model(model_dir)
-    assert str(error.value).isprintable()
-    assert len(str(error.value)) < 600
+    whole = json.loads(file.read_text())
+    info, files = whole["info"], whole["files"]
+    for change, fault in (
+        ("{", "is damaged"),
+        ("[]", "is damaged"),
+        ("[" * 100_000, r"is damaged \(is nested deeper than 32 levels\)"),
+        ({"files": ...}, r"is damaged \(files: Field required\)"),
+        ({"version": 99}, "has version 99; version 6 is read here"),
+        ({"version": ["x"] * 10**5}, "has version"),
+        ({"files": {}}, "its list of files is not that of a model"),
+        ({"files": {**files, "../x": "a"}}, "its list of files is not"),
+        ({"files": {MODEL_FILE: "5"}}, r"is damaged \(SHA-256"),
+        ({"info": info | {"classes": ["grass", 3]}}, r"info\.classes\.1: Input should be a valid string"),
+        ({"info": info | {"classes": ["ice", "mud", "sand"]}}, "its classes are not those of the manifest"),
+        ({"info": info | {"window_s": -2.0}}, r"is damaged \(window length_s is -2\.0"),
+        ({"info": info | {"window_s": 10**400}}, "more than 64 bits"),
+        ({"info": info | {"window_s": float("nan")}}, "holds NaN, finite numbers"),
+        ({"info": info | {"steady": {"a\nb": 1}}}, "is damaged"),
+        ({"info": info | {"rate_hz": dict.fromkeys(info["rate_hz"], 1e308)}}, "is damaged"),
+        ({"info": info | {"channels": {"imu": ["gyro_x_radps"]}}}, "cannot be loaded"),
+    ):
+        if not isinstance(change, str):
+            change = json.dumps({name: each for name, each in (whole | change).items() if each is not ...})
+        file.write_text(change)
+        with pytest.raises(ModelError, match=fault) as error:
+            read_model(model_dir)
+        assert str(error.value).isprintable()
+        assert len(str(error.value)) < 600
 
 
 @pytest.mark.parametrize("name", [MODEL_FILE, MANIFEST_FILE])

@@ -29,35 +29,23 @@ from terrain.errors import ConfigError, TerrainError
 ROOT = Path(__file__).resolve().parents[3]
 
 
-@pytest.mark.parametrize(
-    ("compute", "address"),
-    [
+def test_an_address_is_read_and_another_text_refused_in_one_sentence():
+    for compute, address in (
         ("dask:127.0.0.1:8786", "tcp://127.0.0.1:8786"),
         ("dask:tcp://node-3.lab:1", "tcp://node-3.lab:1"),
         ("dask:tls://[::1]:8786", "tls://[::1]:8786"),
         ("local", None),
-        *((text, ...) for text in ("", "dask", "dask:", "dask:host", "dask:host:0", "dask:host:65536")),
-        *((text, ...) for text in ("dask:http://h:1", "ray:h:1")),
-    ],
-)
-def test_an_address_is_read_and_another_text_refused_in_one_sentence(compute, address):
-    if address is ...:
-        with pytest.raises(ConfigError, match="'local' or the address of a Dask scheduler"):
-            computing(compute).__enter__()
-    else:
+    ):
         assert scheduler_address(compute) == address
-
-
-def test_results_of_two_processes_come_in_the_order_of_their_tasks():
-    assert list(parallel(pow, (2,), [(number,) for number in range(40)], 2)) == [2**k for k in range(40)]
-
-
-def test_no_scheduler_is_one_sentence():
+    for text in ("", "dask", "dask:host", "dask:host:0", "dask:host:65536", "dask:http://h:1", "ray:h:1"):
+        with pytest.raises(ConfigError, match="'local' or the address of a Dask scheduler"):
+            computing(text).__enter__()
     with pytest.raises(TerrainError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9:"):
         computing("dask:127.0.0.1:9").__enter__()
 
 
-def test_a_process_that_ends_is_one_sentence():
+def test_results_of_two_processes_come_in_the_order_of_their_tasks():
+    assert list(parallel(pow, (2,), [(number,) for number in range(40)], 2)) == [2**k for k in range(40)]
     with pytest.raises(TerrainError, match="ended in the middle of its task"):
         list(parallel(os._exit, (), [(3,), (3,)], 2))
 
@@ -76,26 +64,22 @@ def is_over(process):
     return True
 
 
-@pytest.mark.parametrize("request_to_end", [signal.SIGTERM, signal.SIGKILL])
-def test_no_process_is_left_where_the_command_is_ended(request_to_end):
+def test_no_process_is_left_where_the_command_is_killed(tmp_path):
     code = (
-        "import time; from pipelines.learn.parallel import parallel; print('begun', flush=True);"
-        "list(parallel(time.sleep, (), [(0.0,), (0.0,), (300.0,), (300.0,)], 2))"
+        "from pipelines.learn.parallel import parallel\n"
+        "task = 'import time, pathlib; pathlib.Path({!r}).touch(); time.sleep(300.0)'\n"
+        "list(parallel(exec, (), [(task.format(name),) for name in ('first', 'second')], 2))"
     )
-    words = [sys.executable, "-c", code]
-    command = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-
-    def started():
-        return psutil.Process(command.pid).children(recursive=True)
-
+    words, environment = [sys.executable, "-c", code], os.environ | {"PYTHONPATH": str(ROOT)}
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    command = subprocess.Popen(words, cwd=tmp_path, env=environment, **silent)
     try:
-        assert command.stdout.readline() == "begun\n"
-        assert until(lambda: len(started()) >= 3)  # two that compute, one that keeps count of files
-        processes = started()
-        time.sleep(2.0)
+        assert until(lambda: len(list(tmp_path.iterdir())) == 2)  # both compute
+        processes = psutil.Process(command.pid).children(recursive=True)
+        assert len(processes) >= 2
     finally:
-        command.send_signal(request_to_end)
-        command.communicate()
+        command.kill()
+        command.wait()
     assert until(lambda: all(map(is_over, processes)), 20)
 
 
@@ -125,25 +109,23 @@ def test_a_cluster_gives_the_report_of_this_machine(threads_cluster, drive_all):
         assert json.dumps(as_json(crossval(runs, settings))) == json.dumps(as_json(here))
 
 
-def test_errors_of_a_task_keep_their_sentence(threads_cluster):
+def test_errors_of_a_task_keep_their_sentence_and_other_software_on_a_worker_is_refused(
+    threads_cluster, monkeypatch
+):
     results = parallel(WindowRule, (), [(2.0,), (-1.0,)], 1)
     with computing(threads_cluster), pytest.raises(ConfigError, match="it must be positive"):
         list(results)
-
-
-def test_other_software_on_a_worker_is_refused(threads_cluster, monkeypatch):
     other = software() | {"numpy": "1.0"}
     monkeypatch.setattr(cluster, "difference", lambda _, there: difference(other, there))
     with pytest.raises(TerrainError, match=r"worker tcp://.* has numpy .* where 1\.0 is needed"):
         computing(threads_cluster).__enter__()
 
 
+@pytest.mark.slow
 def test_a_cluster_without_workers_is_one_sentence(monkeypatch):
     monkeypatch.setattr(cluster, "FIRST_WORKER_S", 0.2)
-    with (
-        quiet_cluster(0) as empty,
-        pytest.raises(TerrainError, match="has no worker: start one with 'dask worker tcp://"),
-    ):
+    no_worker = "has no worker: start one with 'dask worker tcp://"
+    with quiet_cluster(0) as empty, pytest.raises(TerrainError, match=no_worker):
         computing(empty).__enter__()
 
 

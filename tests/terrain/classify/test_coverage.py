@@ -1,7 +1,6 @@
 """Training coverage of held-out windows: a run never covers itself, and what was never driven is asked for first."""
 
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -28,20 +27,11 @@ from terrain.classify.limits import Motion, SupportLevel
 RUNS = [(name, speed) for speed in (0.2, 0.6) for name in ("ice", "mud") for _ in range(5)]
 
 
-class Evaluated(NamedTuple):
-    held_out: HeldOut
-    run_id: np.ndarray
-    motion: Motion
-
-    def coverage(self):
-        return SimpleNamespace(**coverage_of(*self, 2.0, 0))
-
-    def runs_near(self):
-        return held_out_support(*self)[0][0]
-
-
 def evaluated(runs, folds=3, seed=0):
-    """Return 20 held-out windows a run ``(class, speed)``: right mostly where another run drove the class so fast."""
+    """Return held-out outputs, runs and motions of 20 windows a run ``(class, speed)``.
+
+    They are right mostly where another run drove the class so fast.
+    """
     rng, number = np.random.default_rng(seed), np.repeat(np.arange(len(runs)), 20)
     terrain, n = np.array([runs[i][0] for i in number]), len(number)
     speed = np.array([runs[i][1] for i in number]) + rng.normal(0, 0.005, n)
@@ -52,30 +42,29 @@ def evaluated(runs, folds=3, seed=0):
         for k in range(folds):
             test = np.flatnonzero(fold == k)
             results.append(FoldResult(Fold(0, k, np.flatnonzero(fold != k), test), probability[test], {}))
-        return Evaluated(HeldOut.of_folds(results, terrain), run_id, Motion(speed, np.zeros(n), np.zeros(n)))
+        return HeldOut.of_folds(results, terrain), run_id, Motion(speed, np.zeros(n), np.zeros(n))
 
     classes = np.unique(terrain)
-    seen = of(np.full((n, len(classes)), 0.5)).runs_near() > 0
+    seen = held_out_support(*of(np.full((n, len(classes)), 0.5)))[0][0] > 0
     right = rng.random(n) < np.where(seen, 0.9, 0.1)
     answer = np.where(right, np.searchsorted(classes, terrain), (np.searchsorted(classes, terrain) + 1) % 2)
     return of(np.where(np.arange(len(classes)) == answer[:, None], 0.9, 0.1))
 
 
 def test_coverage_is_counted_among_other_runs_of_the_fold_only():
-    one = evaluated([*RUNS, ("ice", 1.5)])
-    near, own = one.runs_near(), one.run_id == str(len(RUNS))
+    held_out, run_id, motion = evaluated([*RUNS, ("ice", 1.5)])
+    near, own, terrain = held_out_support(held_out, run_id, motion)[0][0], run_id == "20", held_out.truth
     assert (near[own] == 0).all()  # a run never supports itself
     assert (near[~own] > 0).all()
-    terrain = one.held_out.truth
-    for _, _, train, test in (result.fold for result in one.held_out.results):
+    for _, _, train, test in (result.fold for result in held_out.results):
         for row in test:
-            beside = np.abs(one.motion.speed_mps[train] - one.motion.speed_mps[row]) < 0.1
-            assert near[row] == len(np.unique(one.run_id[train][beside & (terrain[train] == terrain[row])]))
+            beside = np.abs(motion.speed_mps[train] - motion.speed_mps[row]) < 0.1
+            assert near[row] == len(np.unique(run_id[train][beside & (terrain[train] == terrain[row])]))
 
 
 def test_the_terrain_that_was_driven_once_at_a_speed_is_asked_for_first():
-    one = evaluated([*RUNS, ("ice", 1.5), ("mud", 1.5), ("mud", 1.5), ("mud", 1.5)])
-    found = one.coverage()
+    of_windows = evaluated([*RUNS, ("ice", 1.5), ("mud", 1.5), ("mud", 1.5), ("mud", 1.5)])
+    found = SimpleNamespace(**coverage_of(*of_windows, 2.0, 0))
     first = found.next_drives[0]
     assert (first.terrain, first.windows, first.support_runs) == ("ice", 20, 1.0)
     assert first.regime.startswith("straight at ")
@@ -86,7 +75,7 @@ def test_the_terrain_that_was_driven_once_at_a_speed_is_asked_for_first():
     assert [row["support"] for row in found.accuracy_by_support] == [level.value for level in SupportLevel]
     never = found.accuracy_by_support[0]
     assert never["accuracy"] < 0.3
-    assert never["windows_ratio"] == pytest.approx(20 / len(one.run_id))
+    assert never["windows_ratio"] == pytest.approx(20 / len(of_windows[1]))
 
 
 @pytest.mark.parametrize("law", [(0.05, 0.7, 1.0), (0.0, 0.9, 0.5)])
@@ -106,21 +95,18 @@ LAWS = st.tuples(st.floats(0, 0.3), st.floats(0.05, 0.7), st.floats(0.1, 2))
 
 
 @given(LAWS, st.floats(0, 20), st.integers(1, 6))
-def test_a_gain_is_never_negative_nor_more_than_the_errors_of_its_cell(law, runs, added):
+def test_laws_of_a_gain(law, runs, added):
+    """It is never negative nor more than the errors of its cell; these raise it, and support lowers it."""
     gain = expected_gain(law, *cells(runs=runs, held_out=runs), added)[0]
     assert 0 <= gain <= 0.2
     assert gain <= expected_gain(law, *cells(runs=runs, held_out=runs), added + 1)[0]
-
-
-@given(LAWS)
-def test_errors_and_expected_driving_raise_a_gain_and_support_lowers_it(law):
     gain = expected_gain(law, *cells())[0]
     assert expected_gain(law, *cells(n_errors=40.0))[0] > gain
     assert expected_gain(law, *cells(ratio=0.4))[0] == pytest.approx(2 * gain)
     assert expected_gain(law, *cells(runs=9.0))[0] < gain
 
 
-@pytest.mark.parametrize("speeds", [(0.2, 0.4, 0.6, 0.8), (0.24, 0.39, 0.63, 0.79), (0.5,), (0.3, 2.0)])
+@pytest.mark.parametrize("speeds", [(0.24, 0.39, 0.63, 0.79), (0.5,), (0.3, 2.0)])
 def test_a_commanded_speed_is_not_cut_in_two(speeds):
     rng = np.random.default_rng(0)
     driven = np.concatenate([speed + rng.normal(0, 0.01, 200) for speed in speeds])
@@ -133,18 +119,17 @@ def test_a_commanded_speed_is_not_cut_in_two(speeds):
     assert len(edges) == 2 or np.ptp(driven) > MIN_WIDTH_MPS
 
 
-@pytest.mark.parametrize(
-    ("speed", "yaw", "ratio", "expected"),
-    [
-        (0.5, 0.0, 0.0, Manoeuvre.STRAIGHT),
-        (0.5, 0.3, 0.2, Manoeuvre.CURVE),
-        (0.3, 0.05, 1.0, Manoeuvre.SPIN),
-        (0.5, np.nan, 0.05, Manoeuvre.STRAIGHT),
-        (0.5, np.nan, 0.4, Manoeuvre.CURVE),
-        (0.1, 1.0, np.nan, Manoeuvre.SPIN),
-        (0.5, 1.0, np.nan, Manoeuvre.CURVE),
-        (0.5, np.nan, np.nan, Manoeuvre.STRAIGHT),
-    ],
-)
-def test_what_a_robot_does(speed, yaw, ratio, expected):
-    assert manoeuvres(Motion(*(np.array([value]) for value in (speed, yaw, ratio))))[0] == expected
+def test_what_a_robot_does():
+    straight, curve, spin = Manoeuvre
+    rows = [
+        (0.5, 0.0, 0.0, straight),
+        (0.5, 0.3, 0.2, curve),
+        (0.3, 0.05, 1.0, spin),
+        (0.5, np.nan, 0.05, straight),
+        (0.5, np.nan, 0.4, curve),
+        (0.1, 1.0, np.nan, spin),
+        (0.5, 1.0, np.nan, curve),
+        (0.5, np.nan, np.nan, straight),
+    ]
+    *motion, expected = map(np.array, zip(*rows, strict=True))
+    assert manoeuvres(Motion(*motion)).tolist() == expected.tolist()

@@ -1,3 +1,5 @@
+"""Folds: their laws, that they differ by seed, and how much is left to train on."""
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -26,7 +28,7 @@ def draw_runs(n_runs, rng, dtype=str):
     return np.array(y, dtype=dtype), np.array(groups, dtype=dtype)
 
 
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 2**32 - 1),
     n_runs=st.lists(st.integers(1, 9), min_size=2, max_size=5),
@@ -75,10 +77,6 @@ def test_different_seeds_give_different_folds_though_runs_are_of_unequal_length(
     assert len({t.tobytes() for t in together}) == 40
     together_ratio = together.mean(axis=0)[np.triu_indices(len(runs), 1)]
     assert together_ratio.max() < 0.6  # no two runs always meet
-    np.testing.assert_array_equal(
-        fold_numbers(y, groups, 5, np.random.default_rng(7)),
-        fold_numbers(y, groups, 5, np.random.default_rng(7)),
-    )
 
 
 def test_too_few_classes_or_runs_for_folds_are_refused():
@@ -90,21 +88,18 @@ def test_too_few_classes_or_runs_for_folds_are_refused():
         next(split_runs(y, groups, 5, rng))
 
 
-@pytest.mark.parametrize(
-    ("counts", "held_out"),
-    [
+def test_enough_is_left_of_every_terrain(make_run):
+    for counts, held_out in (
         ({"ice": 6, "mud": 7, "sand": 2}, ["ice_5", "mud_6"]),
         ({"ice": 5, "mud": 4}, ["ice_4"]),
         ({"ice": 3, "mud": 2}, []),  # five runs are needed for five folds
         ({"ice": 2, "mud": 2, "sand": 2}, []),
         ({}, []),
-    ],
-)
-def test_enough_is_left_of_every_terrain(make_run, counts, held_out):
-    runs = [make_run(f"{name}_{i}", name, i, 1.0) for name, n in counts.items() for i in range(n)]
-    training, out = hold_out_runs(runs)
-    assert [each.run_id for each in out] == held_out
-    assert sorted(each.run_id for each in (*training, *out)) == sorted(each.run_id for each in runs)
+    ):
+        runs = [make_run(f"{name}_{i}", name, i, 1.0) for name, n in counts.items() for i in range(n)]
+        training, out = hold_out_runs(runs)
+        assert [each.run_id for each in out] == held_out
+        assert sorted(each.run_id for each in (*training, *out)) == sorted(each.run_id for each in runs)
 
 
 @pytest.mark.parametrize("lacking", [False, True])

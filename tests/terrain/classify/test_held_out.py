@@ -24,16 +24,12 @@ def test_the_curve_draws_that_many_runs_and_leaves_test_folds_alone():
             assert len(set(run_id[drawn.train][terrain[drawn.train] == name])) == n_runs
         whole = original.train[np.isin(run_id[original.train], run_id[drawn.train])]
         np.testing.assert_array_equal(drawn.train, whole)  # a run that is drawn is drawn whole
-    draws = [
-        {tuple(fold.train) for fold in drawn_folds_ if fold.repeat == draw} for draw in range(CURVE_DRAWS)
-    ]
-    assert draws[0] != draws[1]
+    first, second = ({tuple(fold.train) for fold in drawn_folds_ if fold.repeat == draw} for draw in range(2))
+    assert first != second
     assert runs_per_class == pytest.approx([1.0, (2 + 2 + 1) / 3, (3 + 3 + 1) / 3, (4 + 4 + 1) / 3])
 
 
 RUN_ID = np.repeat([f"{name}_{i}" for name in ("ice", "mud", "tar") for i in range(4)], 6)
-
-
 TERRAIN = np.array([run[:3] for run in RUN_ID])
 
 
@@ -47,9 +43,6 @@ def test_no_run_of_the_left_out_terrain_and_no_tested_run_trains():
         assert left_out not in {*TERRAIN[train], *TERRAIN[test]}
         assert not set(RUN_ID[train]) & set(RUN_ID[test])
         assert len(test)
-
-
-def test_two_terrains_and_few_runs_are_refused():
     two = TERRAIN != "tar"
     with pytest.raises(DataError, match=r"2 terrains \(ice, mud\).*at least 3"):
         left_out_folds(TERRAIN[two], RUN_ID[two], 5, 1, 0)
@@ -92,9 +85,7 @@ def test_a_class_with_too_little_on_a_side_is_left_out_and_named():
         _, split = slow_fast_split(*windows_of(PLAN, 28.0, stride_s), 2.0)
         assert split.left_out["ASPHALT"] == "slow runs: 56 s"
 
-
-def test_a_run_slow_on_one_class_and_fast_on_another_is_on_no_side():
-    """Its windows would otherwise train and test at once."""
+    # A run that is slow on one class and fast on another is on no side: its windows would train and test at once.
     fastest, run_id, terrain, start_s = windows_of(PLAN)
     run_id = np.where(np.isin(run_id, ["GRASS_1", "GRAVEL_4"]), "mixed", run_id)
     side, _ = slow_fast_split(fastest, run_id, terrain, start_s, 2.0)

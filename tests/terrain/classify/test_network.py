@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import ShortTimeFFT
 from scipy.special import log_softmax
@@ -63,7 +63,9 @@ def fitted():
 def test_a_network_learns_a_vibration_of_runs_it_never_saw(fitted):
     X, y, _ = draw_windows(seed=1)
     assert np.mean(fitted.predict(X) == y) > 0.9
-    np.testing.assert_allclose(fitted.predict_proba(X).sum(axis=1), 1.0)
+    # One window has the bytes of many.
+    one_by_one = np.concatenate([fitted.predict_proba(X[i : i + 1]) for i in range(40)])
+    assert np.array_equal(one_by_one, fitted.predict_proba(X)[:40])
     with pytest.raises(DataError, match="infinite"):
         log_probabilities(fitted.onnx_, COLUMNS, np.full((1, WIDTH), np.inf))
     with pytest.raises(DataError, match="is needed"):
@@ -87,12 +89,6 @@ def test_the_graph_computes_what_torch_computes():
     np.testing.assert_allclose(log_probabilities(graph, COLUMNS, X), log_softmax(desired, axis=1), atol=2e-5)
 
 
-def test_one_window_has_the_bytes_of_many(fitted):
-    X, _, _ = draw_windows(seed=2, n_windows=30)
-    whole = fitted.predict_proba(X)
-    assert np.array_equal(np.concatenate([fitted.predict_proba(X[i : i + 1]) for i in range(40)]), whole[:40])
-
-
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_leaves_the_generator_alone(fitted):
     X, y, run = draw_windows()
@@ -105,21 +101,16 @@ def test_the_same_seed_gives_the_same_bytes_and_leaves_the_generator_alone(fitte
     assert not np.array_equal(quick(seed=1).fit(X, y, run).predict_proba(X), fitted.predict_proba(X))
 
 
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        (lambda X, y, run: (X, np.full(len(y), "ice"), run), "all windows are 'ice'"),
-        (lambda X, y, run: (X[:, :-1], y, run), "do not describe rows of 119 columns"),
-        (lambda X, y, run: (X[[0, 39, 41]], y[[0, 39, 41]], run[[0, 39, 41]]), "too few to hold some"),
-    ],
-)
-def test_what_cannot_be_learned_is_refused_in_one_sentence(change, sentence):
-    with pytest.raises(DataError, match=sentence):
-        quick(epochs=1).fit(*change(*draw_windows()))
-
-
-def test_without_torch_training_is_refused_and_classifying_is_not(fitted, monkeypatch):
+def test_what_cannot_be_learned_is_refused_and_without_torch_classifying_is_not(fitted, monkeypatch):
     X, y, run = draw_windows()
+    few = [0, 39, 41]
+    for rows, sentence in (
+        ((X, np.full(len(y), "ice"), run), "all windows are 'ice'"),
+        ((X[:, :-1], y, run), "do not describe rows of 119 columns"),
+        ((X[few], y[few], run[few]), "too few to hold some"),
+    ):
+        with pytest.raises(DataError, match=sentence):
+            quick(epochs=1).fit(*rows)
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(ConfigError, match="pip install"):
         quick().fit(X, y, run)
@@ -135,6 +126,7 @@ def test_the_spectrogram_is_that_of_scipy():
     np.testing.assert_allclose(found, np.abs(slices[:, :, 1:]) ** 2, atol=1e-9)
 
 
+@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["shift", "gain", "mirror", "dropout"]))
 def test_a_variation_keeps_what_it_must(seed, name):
     rng = np.random.default_rng(seed)
@@ -162,28 +154,22 @@ def test_a_variation_keeps_what_it_must(seed, name):
         assert not (failed[0] & failed[1]).any()  # one sensor at a time
 
 
-@pytest.mark.parametrize(
-    ("channels", "signs"),
-    [
-        (("gyro_x_radps", "gyro_y_radps", "gyro_z_radps"), (-1.0, 1.0, -1.0)),
-        (("accel_x_mps2", "accel_y_mps2", "accel_z_mps2"), (1.0, -1.0, 1.0)),
-        (("speed_x_mps", "speed_y_mps", "yaw_rate_radps"), (1.0, -1.0, -1.0)),
-        (("current_left_a", "current_right_a"), (1.0, 1.0)),
-        (("current_1_a", "current_2_a"), None),
-        (("speed_left_mps",), None),
-    ],
-)
-def test_the_mirror_turns_what_geometry_turns(channels, signs):
+def test_the_mirror_turns_what_geometry_turns():
     """A vector keeps x and z and turns y in the plane y = 0; a rate, an axial vector, the reverse."""
-    mirror = mirror_of(channels)
-    assert (mirror and mirror[1]) == signs
-    if mirror is not None:
-        assert [mirror[0][place] for place in mirror[0]] == list(range(len(channels)))
+    for channels, mirror in (
+        (("gyro_x_radps", "gyro_y_radps", "gyro_z_radps"), ((0, 1, 2), (-1.0, 1.0, -1.0))),
+        (("accel_x_mps2", "accel_y_mps2", "accel_z_mps2"), ((0, 1, 2), (1.0, -1.0, 1.0))),
+        (("speed_x_mps", "speed_y_mps", "yaw_rate_radps"), ((0, 1, 2), (1.0, -1.0, -1.0))),
+        (("current_left_a", "current_right_a"), ((1, 0), (1.0, 1.0))),
+        (("current_1_a", "current_2_a"), None),  # wheels with numbers have places that only the robot knows
+        (("speed_left_mps",), None),
+    ):
+        assert mirror_of(channels) == mirror
     with_numbers = SampleColumns("wheels", ("motor_1_radps",), 10.0, 10)
     assert mirrors_of((COLUMNS[0], with_numbers)) is None
 
 
-@pytest.mark.parametrize("temperature", [0.4, 1.0, 1.7, 4.0])
+@pytest.mark.parametrize("temperature", [0.4, 1.7])
 def test_the_temperature_is_found_again(temperature):
     rng = np.random.default_rng(0)
     logits = rng.normal(size=(20000, 3))

@@ -1,3 +1,5 @@
+"""Terrain by what wheels answer: hidden responses are found, and what driving alone says does not count."""
+
 import numpy as np
 import pytest
 from sklearn.base import clone

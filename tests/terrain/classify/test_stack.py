@@ -31,16 +31,14 @@ def quick(**changed):
     return GroupedStack(COLUMNS, **(settings | changed))
 
 
-@pytest.mark.parametrize(("informed", "weight"), [("features", "weight_svm"), ("samples", "weight_cnn")])
-def test_the_one_that_knows_has_the_weight_and_is_chosen(informed, weight):
-    X, y, run = draw(informed)
-    stack = quick().fit(X, y, run)
-    other = {"weight_svm": "weight_cnn", "weight_cnn": "weight_svm"}[weight]
-    assert getattr(stack.best_, weight) > getattr(stack.best_, other)
-    test, truth, _ = draw(informed, seed=1)
+def test_the_one_that_knows_has_the_weight_and_is_chosen():
+    X, y, run = draw("samples")
+    stack, (test, truth, _) = quick().fit(X, y, run), draw("samples", seed=1)
+    assert stack.best_.weight_cnn > stack.best_.weight_svm
     assert np.mean(stack.predict(test) == truth) > 0.9
-    best = quick(choose=True).fit(X, y, run)
-    assert best.best_.used in ({"svm"} if informed == "features" else {"cnn", "stack"})
+    X, y, run = draw("features")
+    best, (test, truth, _) = quick(choose=True).fit(X, y, run), draw("features", seed=1)
+    assert (best.best_.used, best.network_) == ("svm", None)
     assert np.mean(best.predict(test) == truth) > 0.9
 
 
@@ -55,8 +53,8 @@ def test_weights_are_those_of_a_search_over_a_grid():
         p = joined(both, np.array(w))[np.arange(300), truth]
         return -np.log(p).mean() + 0.1 * ((np.array(w) - 0.5) ** 2).sum()
 
-    grid = [(a, b) for a in np.linspace(0, 3, 61) for b in np.linspace(0, 3, 61)]
-    np.testing.assert_allclose(fit_weights(both, truth), min(grid, key=loss), atol=0.06)
+    grid = [(a, b) for a in np.linspace(0, 3, 31) for b in np.linspace(0, 3, 31)]
+    np.testing.assert_allclose(fit_weights(both, truth), min(grid, key=loss), atol=0.11)
     assert (fit_weights(both[::-1], truth) >= 0).all()
 
 
@@ -81,11 +79,7 @@ def test_rows_without_features_are_refused():
 
 def test_the_loss_of_a_stack_is_by_weights_of_other_runs():
     rng = np.random.default_rng(0)
-    both, truth, run = (
-        rng.dirichlet(np.ones(3), (2, 60)),
-        rng.integers(3, size=60),
-        np.repeat(np.arange(3), 20),
-    )
+    both, truth, run = rng.dirichlet(np.ones(3), (2, 60)), rng.integers(3, size=60), np.arange(60) // 20
     crossed = cross_joined(both, truth, run, 0)
     for other in range(3):
         weights = fit_weights(both[:, run != other], truth[run != other])
