@@ -223,12 +223,7 @@ class Grip(NamedTuple):
 
 
 def grip_step(
-    robot: BicycleRobot,
-    grip: Grip,
-    force_mps2: float,
-    slips: Array,
-    slip_std: Array,
-    dt_s: float,
+    robot: BicycleRobot, grip: Grip, force_mps2: float, slips: Array, slip_std: Array, dt_s: float
 ) -> Grip:
     """Return the next grip, by the lateral specific force u r + g sin a and estimated slips (2,).
 

@@ -29,12 +29,7 @@ from terrain.slip_learning.curve import (
     tractive_efficiency,
 )
 from terrain.slip_learning.learn import LearnedTerrain, TerrainRun, learn_terrain, terrain_runs
-from terrain.slip_learning.measured import (
-    Measured,
-    OperatingPoints,
-    operating_points,
-    surface_slip,
-)
+from terrain.slip_learning.measured import Measured, OperatingPoints, operating_points, surface_slip
 from terrain.terramechanics.soil import load_soil
 
 FALLBACK = "unknown"

@@ -47,10 +47,7 @@ Settings = TypeVar("Settings", bound=tuple[Any, ...])
 
 
 def checked(
-    what: str,
-    settings: Settings,
-    above_zero: Collection[str] = (),
-    most: Mapping[str, float] | None = None,
+    what: str, settings: Settings, above_zero: Collection[str] = (), most: Mapping[str, float] | None = None
 ) -> Settings:
     """Return settings, a named tuple of numbers, as floats.
 

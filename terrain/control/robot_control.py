@@ -31,23 +31,11 @@ import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.control.path_tracking import SETTINGS as TRACKING
-from terrain.control.path_tracking import (
-    TrackReport,
-    TrackState,
-    TrackStatus,
-    check_tracking,
-    track_step,
-)
+from terrain.control.path_tracking import TrackReport, TrackState, TrackStatus, check_tracking, track_step
 from terrain.control.pid import LONGEST_STEP_S, DriveState, Gains, WheelPid, wheel_step
 from terrain.control.slip_table import DRIVE_STATES, CurveEntry, SlipTable
 from terrain.control.stability import check_stable
-from terrain.control.switching import (
-    SWITCHING,
-    OutputStatus,
-    TerrainBelief,
-    approach,
-    drive_on,
-)
+from terrain.control.switching import SWITCHING, OutputStatus, TerrainBelief, approach, drive_on
 from terrain.control.traction import (
     TractionState,
     TractionStatus,

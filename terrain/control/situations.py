@@ -137,10 +137,7 @@ def make_situation(
 
 
 def simulate_situation(
-    robot: Robot,
-    situation: Situation,
-    controller: Callable[[Sample], Command],
-    delay_s: float,
+    robot: Robot, situation: Situation, controller: Callable[[Sample], Command], delay_s: float
 ) -> RunLog:
     """Return the log of a robot in a situation, driven by a controller with a delay from a sample to the wheel."""
     return simulate(

@@ -56,11 +56,7 @@ SLOPES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 LARGEST_FACTOR = 1e3  #: A larger gain margin is given as infinite.
 
 
-def check_stable(
-    robot: Robot,
-    gains: Gains,
-    delay_s: float = DELAY_S,
-) -> float:
+def check_stable(robot: Robot, gains: Gains, delay_s: float = DELAY_S) -> float:
     """Return the factor on all gains at which the loop becomes unstable somewhere in the robot's range of operation.
 
     It is above 1, and infinite for none; ``ConfigError`` is raised if the loop is unstable at some speed, or the delay
@@ -105,10 +101,7 @@ def check_stable(
 
 
 def loop_matrices(
-    robot: Robot,
-    gains: Gains,
-    delay_s: float,
-    places: Sequence[tuple[float, float, float]],
+    robot: Robot, gains: Gains, delay_s: float, places: Sequence[tuple[float, float, float]]
 ) -> Array:
     """Return the closed loops (k, n, n) of ``pid_step`` and the plant from one sample to the next; without the drift.
 

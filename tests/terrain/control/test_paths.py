@@ -5,13 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrain.control.car_following import (
-    SteeringSettings,
-    SteerState,
-    SteerStatus,
-    law_17,
-    steer,
-)
+from terrain.control.car_following import SteeringSettings, SteerState, SteerStatus, law_17, steer
 from terrain.control.paths import PathStatus, Place, path_from_curvature, path_from_points, read_path
 from terrain.errors import DataError, TerrainError
 from terrain.robots import load_robot

@@ -8,13 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from terrain.control.car_following import SteeringSettings, check_steering
-from terrain.control.pid import (
-    LONGEST_STEP_S,
-    Gains,
-    WheelPid,
-    pid_step,
-    wheel_step,
-)
+from terrain.control.pid import LONGEST_STEP_S, Gains, WheelPid, pid_step, wheel_step
 from terrain.control.slip_table import DRIVE_STATES
 from terrain.control.switching import SWITCHING, check_switching
 from terrain.errors import ConfigError
@@ -59,10 +53,7 @@ def test_a_fault_gives_nothing_and_keeps_the_integral():
         assert pid_step(Gains(1.0, 1.0, 100.0), 0.3, error, dt_s) == (0.0, 0.3, False)
 
 
-CHECKS = {
-    "switching: ": (check_switching, SWITCHING),
-    "steering: ": (check_steering, SteeringSettings()),
-}
+CHECKS = {"switching: ": (check_switching, SWITCHING), "steering: ": (check_steering, SteeringSettings())}
 ZERO_UP = "from zero up"
 
 

@@ -75,11 +75,7 @@ def small_changes(gains, n_delayed, speed_mps, slip_ratio, slope_ratio, n_sample
 
 @pytest.mark.parametrize(
     ("numbers", "n_delayed", "where"),
-    [
-        ((3.5, 1.0), 3, (1.0, 0.13, 0.6)),
-        ((6.0, 0.0), 0, (0.05, -0.2, 0.3)),
-        ((4.0, 4.0), 1, (0.1, 0.2, 3.0)),
-    ],
+    [((3.5, 1.0), 3, (1.0, 0.13, 0.6)), ((6.0, 0.0), 0, (0.05, -0.2, 0.3)), ((4.0, 4.0), 1, (0.1, 0.2, 3.0))],
 )
 def test_a_small_change_grows_or_decays_by_the_largest_eigenvalue(numbers, n_delayed, where):
     gains = Gains(*numbers, MOST_RADPS)
