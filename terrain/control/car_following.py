@@ -325,10 +325,8 @@ class CarFollower:
     ) -> None:
         self._robot, self._path, self._source = robot, path, SlipSource(source)
         if observer is None:
-            kind = {SlipSource.NONE: "kinematic", SlipSource.GRIP: "multi"}.get(
-                self._source, self._source.value
-            )
-            name = f"sideslip-{kind}"
+            kinds = {SlipSource.NONE: "kinematic", SlipSource.GRIP: "multi"}
+            name = f"sideslip-{kinds.get(self._source, self._source.value)}"
             without = SETTINGS[name]._replace(by_fixes=False) if self._source is SlipSource.NONE else None
             observer = Sideslip(robot, name, without)
         self._observer = observer
@@ -353,9 +351,8 @@ class CarFollower:
         x_m, y_m, yaw_rad = known.mean[:3].tolist()
         place = self._path.locate(x_m, y_m, yaw_rad, self._before_m)
         is_first = math.isnan(self._before_m)
-        if place.status not in (PathStatus.NO_POSE, PathStatus.FAR) or (
-            is_first and place.status is PathStatus.FAR
-        ):
+        lost = PathStatus.NO_POSE, *(() if is_first else (PathStatus.FAR,))
+        if place.status not in lost:
             self._before_m = place.distance_m
         slips = np.zeros(2) if self._source is SlipSource.NONE else known.slip
         desired, grip = sample.speed_desired_mps, _NO_GRIP
@@ -367,11 +364,8 @@ class CarFollower:
             force = float(measured[SPEED] * measured[RATE]) + GRAVITY_MPS2 * math.sin(roll)
             grip = self._grip = grip_step(robot, self._grip, force, known.slip, known.slip_std, dt_s)
             desired = min(desired, preview_speed(grip, path, place.distance_m, roll))
-            for s in (
-                place.distance_m,
-                place.distance_m + abs(speed) * self._reach_s,
-            ):  # of steady cornering there
-                row = path.row_at(s)
+            for ahead_m in (0.0, abs(speed) * self._reach_s):  # of steady cornering there
+                row = path.row_at(place.distance_m + ahead_m)
                 force = speed * speed * float(path.curvature_pm[row])
                 force += GRAVITY_MPS2 * math.sin(path.roll_at(row, roll))
                 expected.append(np.clip(-_axle_masses(robot) * force / known.mean[5:7], -0.2, 0.2))

@@ -311,32 +311,25 @@ def evaluate_drive(
     return row
 
 
-class EnergyCurve(NamedTuple):
-    """Energy over distance of a drive: distance (n,), which never falls, and energy (n,)."""
-
-    distance_m: Array
-    energy_j: Array
-
-
-def energy_curve(history: DriveHistory, scenario: Scenario) -> EnergyCurve:
-    """Return the energy over distance of a drive, while motion is desired: coasting costs nothing."""
+def energy_curve(history: DriveHistory, scenario: Scenario) -> tuple[Array, Array]:
+    """Return distance, which never falls, and energy (n,) while motion is desired: coasting costs nothing."""
     driven = history.time_s <= desired_until(scenario)
-    return EnergyCurve(np.maximum.accumulate(history.distance_m[driven]), history.energy_j[driven])
+    return np.maximum.accumulate(history.distance_m[driven]), history.energy_j[driven]
 
 
-def energy_at_equal_distance(curves: Sequence[EnergyCurve]) -> list[float]:
-    """Return the energy per metre in J/m of each drive, over the distance that all travelled.
+def energy_at_equal_distance(curves: Sequence[tuple[Array, Array]]) -> list[float]:
+    """Return the energy per metre in J/m of drives by their :func:`energy_curve`, over the distance that all travelled.
 
     The distance is the shortest of those drives that travelled at least half of the longest; a drive that
     travelled less has NaN.  So the figure depends on the other drives.
 
     Examples
     --------
-    >>> near, far = (EnergyCurve(np.array([0.0, d]), np.array([0.0, 100.0])) for d in (4.0, 5.0))
+    >>> near, far = ((np.array([0.0, d]), np.array([0.0, 100.0])) for d in (4.0, 5.0))
     >>> energy_at_equal_distance([near, far])
     [25.0, 20.0]
     """
-    travelled_m = [float(curve.distance_m[-1]) for curve in curves]
+    travelled_m = [float(distance_m[-1]) for distance_m, _ in curves]
     equal_m = min(distance for distance in travelled_m if distance >= max(travelled_m) / 2)
     return [
         float(np.interp(equal_m, *curve) / equal_m) if distance >= equal_m > 0.0 else math.nan
@@ -420,7 +413,7 @@ class Drive(NamedTuple):
     """Metrics of one drive by name, its energy over distance, and its curves where they are shown."""
 
     metrics: dict[str, float]
-    energy: EnergyCurve
+    energy: tuple[Array, Array]
     curves: Any = None
 
 

@@ -377,12 +377,9 @@ def evaluate_case(loop: FaultLoop, case: FaultCase, references: References) -> F
     counts = pilot.n_exceptions, pilot.n_not_finite
     figures = fault_figures(drive, clean, plain, start_s, end_s, *counts)
     acts = ((time_s >= start_s) & (time_s < end_s)).tolist()
-    named, bars = (
-        named_sensors(pilot.health, acts, float(time_s[1] - time_s[0])),
-        judge(figures, fault.nature),
-    )
+    named = named_sensors(pilot.health, acts, float(time_s[1] - time_s[0]))
     kind = fault.kind, fault.streams, fault.nature.value
-    return FaultRow(case, *kind, figures, bars, named, pilot.exception)
+    return FaultRow(case, *kind, figures, judge(figures, fault.nature), named, pilot.exception)
 
 
 def clean_drive(place: Place, references: References) -> dict[str, Any]:
@@ -432,9 +429,14 @@ class GuardedPilot:
                 raise
             self.n_exceptions += 1
             self.exception = self.exception or f"{type(error).__name__}: {error}"
-        if command is not None and self._last is not None and not is_finite(command):
-            self.n_not_finite += 1
-            command = None
+        if command is not None and self._last is not None:
+            try:
+                rows = [np.asarray(row, dtype=np.float64) for row in command[:3]]
+                finite = all(row.shape == (3,) and bool(np.isfinite(row).all()) for row in rows)
+            except (TypeError, ValueError):
+                finite = False
+            self.n_not_finite += not finite
+            command = command if finite else None
         if command is None:
             assert self._last is not None
             changed = {"status_code": float(TractionStatus.NO_SLIP), "slip_ratio": math.nan}
@@ -445,15 +447,6 @@ class GuardedPilot:
         self.speed_mps.append(math.nan if estimate is None else estimate.speed_x_mps)
         self.health.append(None if health is None else dict(health))
         return command
-
-
-def is_finite(command: Command) -> bool:
-    """Return whether all that is commanded is three finite numbers."""
-    try:
-        rows = [np.asarray(row, dtype=np.float64) for row in command[:3]]
-    except (TypeError, ValueError):
-        return False
-    return all(row.shape == (3,) and bool(np.isfinite(row).all()) for row in rows)
 
 
 def named_sensors(

@@ -172,9 +172,8 @@ _ZEROS = np.zeros(3)
 class TrackState(NamedTuple):
     """What a step leaves to the next."""
 
-    reference: Array | None = (
-        None  # (3,) x, y and heading p* of the path; None where there is none, as at first
-    )
+    #: (3,) x, y and heading p* of the path; None where there is none, as at first
+    reference: Array | None = None
     desired_once: Array = _ZEROS  #: (3,) desired twist behind a low-pass
     desired: Array = _ZEROS  #: (3,) behind two
     integral: tuple[float, ...] = (0.0, 0.0, 0.0)  #: of the errors along x, along y and of the heading

@@ -117,19 +117,13 @@ def loop_matrices(
     n_delayed = math.ceil(delay_s / dt_s - 1e-9)
     (body, motors, _, _, sensors), third_kg = robot.equipment, robot.mass_kg / 3
     rate, speed, contact, torque, q, estimate, measured, command = np.eye(8)  # w, v, k, T, q, e, y, u
-    lags_s = (
-        motors.torque_time_constant_s,
-        motors.speed_estimate_time_constant_s,
-        sensors.encoder_time_constant_s,
-    )
-    torque_s, estimate_s, encoder_s = (max(lag_s, STEP_S) for lag_s in lags_s)  # as in the simulator
+    lags_s = motors.torque_time_constant_s, motors.speed_estimate_time_constant_s
+    torque_s, estimate_s = (max(lag_s, STEP_S) for lag_s in lags_s)  # as in the simulator
+    encoder_s = max(sensors.encoder_time_constant_s, STEP_S)
     systems = []  # (8, 8) of the plant; the last row, of the command, is 0
     for speed_mps, slip_ratio, slope_ratio in places:
-        traction, braking = (
-            radius_m * (1 - slip_ratio) * rate - speed,
-            radius_m * rate - (1 + slip_ratio) * speed,
-        )
-        slip = (traction if slip_ratio > 0 else braking) / speed_mps
+        by_wheel, by_robot = (1 - slip_ratio, 1.0) if slip_ratio > 0 else (1.0, 1 + slip_ratio)
+        slip = (radius_m * by_wheel * rate - by_robot * speed) / speed_mps
         build_up = (slip - contact) * speed_mps / body.relaxation_length_m
         thrust = slope_ratio * third_kg * GRAVITY_MPS2 * (contact + DEFLECTION_DAMPING_S * build_up)
         speed_error = command - estimate

@@ -207,11 +207,6 @@ def is_lost(time_s: Array, intervals_s: Sequence[tuple[float, float]]) -> Array:
 STANDSTILL_RADPS = 1e-3  # motor rate below which the Hall sensors count no step
 
 
-def add_rate_noise(rate: Array, noise: Array, standstill: float) -> Array:
-    """Return measured rates: an encoder that counts no step, at rates up to ``standstill``, has no noise."""
-    return np.asarray(rate + noise * (np.abs(rate) > standstill))
-
-
 def wheel_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> Sensor:
     """Return motor rates after the motor driver's low-pass on quantised Hall steps, and motor currents.
 
@@ -228,9 +223,8 @@ def wheel_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> Sens
         wheels = motion.record["wheels"][rows]
         true = wheels["reported_radps"] * motors.reduction_ratio, wheels["torque_nm"] / per_amp_nm
         rates, current_a = np.hsplit(changed(time_s[new], np.hstack(true))[1], 2)
-        return np.hstack(
-            [add_rate_noise(rates, motor_noise[new], STANDSTILL_RADPS), current_a + current_noise[new]]
-        )
+        counts = np.abs(rates) > STANDSTILL_RADPS  # an encoder that counts no step has no noise
+        return np.hstack([rates + motor_noise[new] * counts, current_a + current_noise[new]])
 
     return Sensor(motion, WHEELS_CHANNELS, (time_s, rows), write)
 

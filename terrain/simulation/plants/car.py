@@ -329,12 +329,8 @@ def run_car(
             n_ticks = k + 1
             break
     time_s, measured, rows = np.arange(n_ticks) * TICK_S, measured[:n_ticks], rows[: n_ticks * per_tick]
-    truth_s, none, turn, roll = (
-        np.arange(len(rows)) * TRUTH_S,
-        np.zeros(len(rows)),
-        rows["yaw_rate_radps"],
-        rows["roll_rad"],
-    )
+    truth_s, none = np.arange(len(rows)) * TRUTH_S, np.zeros(len(rows))
+    turn, roll = rows["yaw_rate_radps"], rows["roll_rad"]
     at_rear = np.zeros(len(rows), BODY)
     for name in set(BODY.names or ()) & set(CAR_BODY.names or ()):
         at_rear[name] = rows[name]
@@ -344,14 +340,10 @@ def run_car(
     noise = rng.standard_normal((int(fixed.sum()), 2)) * FIX_M / FIX_S
     located = fixes(at_rear[::per_tick][fixed], np.hstack([np.zeros_like(noise), noise]), FIX_M)
     located[:, :2] = measured[fixed, 2:4]
+    pushed = rows["accel_x_mps2"] - rows["side_speed_mps"] * turn, lateral(rows) - GRAVITY_MPS2 * np.sin(roll)
     true = tilted_imu(
         np.column_stack([rows["roll_rate_radps"], none, turn]),
-        np.column_stack(
-            [
-                rows["accel_x_mps2"] - rows["side_speed_mps"] * turn,
-                lateral(rows) - GRAVITY_MPS2 * np.sin(roll),
-            ]
-        ),
+        np.column_stack(pushed),
         np.column_stack([roll, none, rows["yaw_rad"]]),
     )
     drawn = rng.standard_normal((len(rows), 9)) * np.repeat([GYRO_RADPS, ACCEL_MPS2, TILT_RAD], 3)

@@ -270,40 +270,29 @@ def start_state(steer_rad: Array) -> Array:
     return filled(STATE, wheels=wheels, late_rad=steer_rad)
 
 
-def contact_ratio(plant: Array, profile: TerrainProfile) -> float:
-    """Return ``k`` of a plant under its weight, on its stiffest ground, over its limit: unstable from 1 on."""
-    robot = plant[0]
-    load_n = robot["mass_kg"] * GRAVITY_MPS2 * robot["load_fraction"]
-    spin = robot["radius_m"] ** 2 / robot["wheel_inertia_kgm2"]
-    arm_m2 = ((robot["wheels_m"] - robot["com_m"]) ** 2).sum(axis=1)
-    body = 2.0 / robot["mass_kg"] + arm_m2 / robot["yaw_inertia_kgm2"]
-    rates_ps2 = []
-    for ground in profile.patches["ground"]:  # the thrust over its slip is steepest at the start of the curve
-        slope_n = np.array([wheel_ground(ground, load, _SMALL_SLIP, 0.0)[0] for load in load_n]) / _SMALL_SLIP
-        stiffness_npm = slope_n / robot["relaxation_length_m"]
-        rates_ps2.append((stiffness_npm * spin).max() + (stiffness_npm * body).sum())
-    return float(max(rates_ps2)) / CONTACT_LIMIT_PS2
-
-
-def tyre_ratio(plant: Array) -> float:
-    """Return how stiff and damped the tyres are over their limit: unstable from 1 on."""
-    robot = plant[0]
-    corner_kg = robot["mass_kg"] * float(robot["load_fraction"].min())
-    damped = STEP_S * robot["tyre_stiffness_npm"] + 2.0 * robot["tyre_damping_nspm"]
-    return float(STEP_S * damped / 4.0 / corner_kg)
-
-
 def check_step(plant: Array, profile: TerrainProfile, name: str) -> None:
     """Refuse a robot on its terrain whose contacts or tyres are too stiff for the steps of the integration.
+
+    Contacts are those under its weight on its stiffest ground.
 
     Raises
     ------
     ConfigError
         if the contacts, with :data:`LOAD_MARGIN_RATIO`, or the tyres are beyond their limit, or not finite.
     """
+    robot, mass_kg = plant[0], float(plant["mass_kg"][0])
+    load_n = mass_kg * GRAVITY_MPS2 * robot["load_fraction"]
+    spin = robot["radius_m"] ** 2 / robot["wheel_inertia_kgm2"]
+    arm_m2 = ((robot["wheels_m"] - robot["com_m"]) ** 2).sum(axis=1)
+    body, rates_ps2 = 2.0 / mass_kg + arm_m2 / robot["yaw_inertia_kgm2"], []
+    for ground in profile.patches["ground"]:  # the thrust over its slip is steepest at the start of the curve
+        slope_n = np.array([wheel_ground(ground, load, _SMALL_SLIP, 0.0)[0] for load in load_n]) / _SMALL_SLIP
+        stiffness_npm = slope_n / robot["relaxation_length_m"]
+        rates_ps2.append((stiffness_npm * spin).max() + (stiffness_npm * body).sum())
+    contact = LOAD_MARGIN_RATIO * float(np.max(rates_ps2)) / CONTACT_LIMIT_PS2
+    damped = STEP_S * robot["tyre_stiffness_npm"] + 2.0 * robot["tyre_damping_nspm"]
+    tyre = STEP_S * damped / 4.0 / (mass_kg * float(robot["load_fraction"].min()))
     steps = f"robot {name}: its motion cannot be integrated in steps of {STEP_S:g} s: "
-    mass_kg = plant["mass_kg"][0]
-    contact, tyre = LOAD_MARGIN_RATIO * contact_ratio(plant, profile), tyre_ratio(plant)
     if not contact <= 1.0:
         raise ConfigError(
             f"{steps}under {mass_kg:g} kg the contacts are {contact:.3g} times too stiff for the "
@@ -318,9 +307,8 @@ def check_step(plant: Array, profile: TerrainProfile, name: str) -> None:
 
 # Speed over which a resistance takes its full size: it opposes rolling and does not push a robot at rest.
 ROLLING_SPEED_MPS = 0.02
-LEG_RATE_RADPS = (
-    0.5  # how fast the third leg swings through its play; assumed, it crosses one degree in 35 ms
-)
+# How fast the third leg swings through its play; assumed, it crosses one degree in 35 ms.
+LEG_RATE_RADPS = 0.5
 # Moment about its hinge below which the third leg stays where it is; assumed, 7 N on the wheel: a start at 1 m/s^2
 # gives three times as much, steady rolling less.
 LEG_FRICTION_NM = 5.0
@@ -628,15 +616,6 @@ COMMAND_CHANNELS = (
 """The admitted twist of the body, and what it asks of the wheels."""
 
 
-def built_with(robot: Robot, effects: Mapping[str, float]) -> Robot:
-    """Return the robot with all its effects, of which the commanded one lacks some."""
-    if not robot.effects and not effects:
-        return robot
-    acting = checked_effects("effects", {**robot.effects, **effects}, robot.drive)
-    extended = replace(robot, effects=acting, effects_cov=np.full((len(acting), len(acting)), np.nan))
-    return apply_homes(extended, in_plant(Stage.DESCRIPTION))
-
-
 def run_dynamic(
     robot: Robot,
     scenario: Scenario,
@@ -681,7 +660,11 @@ def run_dynamic(
         raise ConfigError(
             f"command_delay_s is {command_delay_s!r}, a time from 0 to {MAX_COMMAND_DELAY_S:g} s is required"
         )
-    rngs, built = sensing.generators(seed, _PURPOSES), built_with(robot, effects)
+    rngs, built = sensing.generators(seed, _PURPOSES), robot
+    if robot.effects or effects:  # with all its effects, of which the commanded one lacks some
+        acting = checked_effects("effects", {**robot.effects, **effects}, robot.drive)
+        built = replace(robot, effects=acting, effects_cov=np.full((len(acting), len(acting)), np.nan))
+        built = apply_homes(built, in_plant(Stage.DESCRIPTION))
     profile = draw_profile(built, scenario, soils, conditions, rngs["terrain"])
     plant = make_plant(built, conditions)
     check_step(plant, profile, built.name)

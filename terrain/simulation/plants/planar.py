@@ -135,7 +135,13 @@ from terrain.files.names import data_folder
 from terrain.kernels import filled, inner, njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.commands import wheel_motion
-from terrain.kinematics.wheels import point_velocity, rolling_matrix, velocity_matrix, wheel_frame_velocities
+from terrain.kinematics.wheels import (
+    TWIST,
+    point_velocity,
+    rolling_matrix,
+    velocity_matrix,
+    wheel_frame_velocities,
+)
 from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS
 from terrain.records import Array, Label, Stream
 from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot
@@ -479,9 +485,8 @@ def slip_along(
         if fast and min(tau, tau_before) > SHORTEST_S and grows > FALLS_MOST:
             slope = (target - target_before) / (dt * (1.0 + grows))
             off = speed[k - 1] - target_before + tau_before * slope
-            change = math.log(
-                tau / tau_before
-            )  # what a step leaves of an offset, v' = -v / tau, as tau runs straight
+            # what a step leaves of an offset, v' = -v / tau, as tau runs straight
+            change = math.log(tau / tau_before)
             if abs(change) < 1e-3:
                 remaining = math.exp(-2.0 * dt / (tau_before + tau))
             else:
@@ -1183,9 +1188,6 @@ def sense(params: Array, vector: Array, dt: float, truth: Array) -> Array:
     return out
 
 
-WHEELS_HZ, IMU_HZ, CAMERA_HZ = 50.0, 100.0, 50.0  # rates of the loggers
-
-
 @cache
 def _spread() -> Any:
     return read_yaml(data_folder("spread") / "planar.yaml")
@@ -1322,13 +1324,8 @@ def run_planar(
 
     # the wheels follow their commands, and the body its wheels
     desired = wheel_motion(robot, twist, 1.0 / RATE_HZ)
-    speed, steer = follow_commands(
-        desired.wheel_speed_mps,
-        desired.steer_rad,
-        round(1.0 / (RATE_HZ * dt)),
-        dt,
-        robot.steering_rate_max_radps,
-    )
+    parts, rate_max = round(1.0 / (RATE_HZ * dt)), robot.steering_rate_max_radps
+    speed, steer = follow_commands(desired.wheel_speed_mps, desired.steer_rad, parts, dt, rate_max)
     n = len(speed)
     loud, levels, turned = float(noise is not None), noise or spread_numbers("noise"), speed
 
@@ -1363,7 +1360,7 @@ def run_planar(
     counts = np.array([1.0 + p[name] if name in INDEX else 1.0 for name in scales])  # encoders may lose some
     true_speed = turned * (1.0 + p["wheel_radius_ratio"]) * sides * counts
     ideal = dict(zip(CHANNELS, sense(planar.body, vector, dt, truth).T, strict=True))
-    v_x, v_y, turn = (truth[name] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"))
+    v_x, v_y, turn = (truth[name] for name in TWIST)
 
     def samples(rate_hz: float) -> tuple[Array, Array]:
         """Return steps and stamps (k,) of a logger."""
@@ -1405,19 +1402,15 @@ def run_planar(
         counted = np.floor(counted / step_m) * step_m
     white_mps = sensors.motor_std_radps / motors.reduction_ratio * robot.wheel_radius_m
     rate_noise = white_mps * white("wheels", k, wheels)
-    std_a, forget_s = (
-        [current_noise_a(levels, robot) / math.sqrt(wheels)] * wheels,
-        [levels["current_s"]] * wheels,
-    )
-    drawn = coloured(white("wheels", wheels, k), std_a, forget_s, dt * every) * moving[:, None]
+    std_a, forget_s = current_noise_a(levels, robot) / math.sqrt(wheels), levels["current_s"]
+    drawn = coloured(white("wheels", wheels, k), [std_a] * wheels, [forget_s] * wheels, dt * every)
+    drawn *= moving[:, None]
     currents = currents + drawn + sensors.current_std_a * white("wheels", k, wheels)
-    measured, lag_s = (
-        np.diff(counted, axis=0) / (every * dt),
-        sensors.encoder_time_constant_s + p["encoder_lag_s"],
-    )
+    measured = np.diff(counted, axis=0) / (every * dt)
+    lag_s = sensors.encoder_time_constant_s + p["encoder_lag_s"]
     measured = np.column_stack([lagged(column.copy(), lag_s, every * dt) for column in measured.T])
     measured[np.abs(measured) <= STANDSTILL_MPS] = 0.0
-    values = robot.logged_rates(sensing.add_rate_noise(measured, rate_noise, STANDSTILL_MPS))
+    values = robot.logged_rates(measured + rate_noise * (np.abs(measured) > STANDSTILL_MPS))
     channels = robot.rate_channels
     if logs_currents:
         currents = np.abs(currents) if robot.on_omni_wheels else currents  # as its logs have them
@@ -1443,14 +1436,11 @@ def run_planar(
         true[:, :2] = np.gradient(tilt, 1.0 / IMU_HZ, axis=0)
         true[:, 2], true[:, 3] = ideal[GYRO][rows], ideal[ACCEL][rows]  # with clock and latency already
         side = np.gradient(v_y, dt) + turn * v_x + GRAVITY_MPS2 * np.sin(roll) * level
-        true[:, 4], true[:, 5] = (
-            late(side, imu_s)[rows],
-            late(GRAVITY_MPS2 * np.cos(roll) * level, imu_s)[rows],
-        )
+        true[:, 4] = late(side, imu_s)[rows]
+        true[:, 5] = late(GRAVITY_MPS2 * np.cos(roll) * level, imu_s)[rows]
         true[:, 8] = (np.cumsum(true[:, 2]) - true[0, 2]) / IMU_HZ
-        vibration = shaken(
-            "imu", "gyro gyro gyro accel accel accel", "radps radps radps mps2 mps2 mps2", IMU_HZ
-        )
+        units = "radps radps radps mps2 mps2 mps2"
+        vibration = shaken("imu", "gyro gyro gyro accel accel accel", units, IMU_HZ)
         still = np.repeat([sensors.gyro_std_radps, sensors.accel_std_mps2], 3)
         drawn[:, :6] = vibration * late(active, imu_s)[rows, None] + still * white("imu", k, 6)
         drawn[:, 6:8] = levels["tilt_rad"] * white("imu", k, 2)
@@ -1487,19 +1477,14 @@ def run_planar(
         streams["odometry"] = Stream(time_s, seen, channels)
 
     steered = len(robot.steer_rows)
-    names = (
-        "speed_x_mps",
-        "speed_y_mps",
-        "yaw_rate_radps",
-        *sensing.wheel_channels("wheel_radps", robot.wheels),
-    )
+    names = *TWIST, *sensing.wheel_channels("wheel_radps", robot.wheels), *robot.steer_rows
     commands = np.hstack([desired.twist, desired.wheel_radps, desired.steer_rad[:, :steered]])
-    streams["commands"] = Stream(np.arange(len(twist)) / RATE_HZ, commands, (*names, *robot.steer_rows))
+    streams["commands"] = Stream(np.arange(len(twist)) / RATE_HZ, commands, names)
     rows, time_s = samples(IMU_HZ)
     body: Any = np.zeros(len(rows), BODY)
     moved: Any = truth[rows]
     tilt = grade[rows]
-    for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"):
+    for name in TWIST:
         body[name] = moved[name]
     body["position_x_m"], body["position_y_m"], body["yaw_rad"] = pose[rows].T
     body["roll_rad"], body["pitch_rad"] = roll[rows], -tilt
@@ -1507,7 +1492,7 @@ def run_planar(
     turning = moved["yaw_rate_radps"] * moved["speed_x_mps"]
     body["accel_y_mps2"] = np.gradient(moved["speed_y_mps"], 1.0 / IMU_HZ) + turning
     places_m = robot.wheel_positions_m * (1.0 + p["wheel_distance_ratio"])
-    motion = np.column_stack([body[name] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")])
+    motion = np.column_stack([body[name] for name in TWIST])
     along, across = wheel_frame_velocities(motion, places_m, steer[rows] + robot.wheel_directions_rad)
     of_wheels = {
         "wheel_radps": speed[rows] * counts / robot.wheel_radius_m,
@@ -1588,10 +1573,7 @@ def follow_commands(
 def _path(truth: Array, dt: float) -> Array:
     """Return east, north and heading (n, 3) of the body's origin, from 0."""
     pose = np.zeros((len(truth), 3))
-    x, y, w = (
-        0.5 * (truth[name][:-1] + truth[name][1:])
-        for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
-    )
+    x, y, w = (0.5 * (truth[name][:-1] + truth[name][1:]) for name in TWIST)
     pose[1:, 2] = np.cumsum(dt * w)
     middle = 0.5 * (pose[1:, 2] + pose[:-1, 2])
     pose[1:, 0] = np.cumsum(dt * (x * np.cos(middle) - y * np.sin(middle)))

@@ -9,7 +9,6 @@ from terrain.control.drive_metrics import (
     LEAST_RAMP_MPS2,
     Comparison,
     Drive,
-    EnergyCurve,
     adaptation_times,
     command_change,
     distance_within,
@@ -154,9 +153,7 @@ def test_adaptation_lasts_until_the_target_is_close_to_that_of_the_new_terrain()
 
 def test_energy_is_compared_over_the_distance_that_all_travelled():
     energy = np.array([0.0, 100.0, 300.0])
-    curves = [
-        EnergyCurve(np.array([0.0, end / 2, end]), energy) for end in (8.0, 6.0, 1.0)
-    ]  # the last is stuck
+    curves = [(np.array([0.0, end / 2, end]), energy) for end in (8.0, 6.0, 1.0)]  # the last is stuck
     expected = [200.0 / 6.0, 300.0 / 6.0, math.nan]
     assert energy_at_equal_distance(curves) == pytest.approx(expected, nan_ok=True)
 
