@@ -165,7 +165,7 @@ def limits_of(robot: Robot, drives: Drives, sensing: Sensing | None = None) -> L
     """
     sensing = sensing or Sensing()
     if not robot.describes("motors") and not sensing.channels:
-        sensing = sensing._replace(channels=(*MOTION, ACCEL))  # no currents are logged
+        sensing = sensing._replace(channels=(GYRO, SPEED_X, SPEED_Y, ACCEL))  # no currents are logged
     robot = with_silent_parts(robot)
     planar, noise = make_planar(robot, Ground()), spread_numbers("noise")
     scatter = sensing.scatter or spread_numbers("scatter")
