@@ -61,13 +61,12 @@ def test_noise_is_as_significant_as_chance_has_it(plain):
     assert max(z) < 4.5
 
 
-@pytest.mark.parametrize("size", [3.0, 30.0])
-def test_a_dependence_of_another_sign_in_each_run_is_none_of_all_runs(plain, size):
+def test_a_dependence_of_another_sign_in_each_run_is_none_of_all_runs(plain):
     signs, c = np.array([1, 1, 1, -1, 1, 1, -1, 1]), CHANNELS.index("yaw_rate_radps")
 
     def change(i, white):
         more = np.zeros_like(white)
-        more[0, :, c] = size * signs[i] * plain.rows[i].inputs[:, 0]
+        more[0, :, c] = 30.0 * signs[i] * plain.rows[i].inputs[:, 0]
         return white + more
 
     assert probed(with_residuals(plain, change))["yaw_rate_radps", "speed"].z < 3.0

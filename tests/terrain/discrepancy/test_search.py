@@ -38,9 +38,8 @@ def stds_off(fit, hidden, inflation=1.0):
 
 @pytest.fixture(scope="module")
 def posed(hide, pose):
-    def make(hidden, library=None, built_in=None):
-        problem = pose(hide(hidden, duration_s=40.0, seed=5), library)
-        return problem._replace(simulation=problem.simulation.with_effects(built_in or {}))
+    def make(hidden, library=None, duration_s=25.0):
+        return pose(hide(hidden, duration_s=duration_s, seed=5), library)
 
     return make
 
@@ -97,7 +96,7 @@ def test_a_set_of_causes_is_not_reached_twice(three, monkeypatch):
 @pytest.mark.parametrize(
     ("hidden", "library", "seeds"),
     [
-        # halfway through 40 s an offset and a rate of a clock add up to nothing: they are found as a pair
+        # halfway through a run an offset and a rate of a clock add up to nothing: they are found as a pair
         ({"clock_offset_s": 0.06, "clock_rate_ratio": -0.003}, None, {}),
         # far off together, from nowhere and from a lag that is known
         ({"camera_latency_s": 0.25, TRACK: 1.5}, "camera_yaw lever_arm gyro_scale", {}),
@@ -151,7 +150,8 @@ def test_a_step_that_raises_the_square_is_halved(monkeypatch):
 
 def test_what_changes_other_channels_is_no_rival(posed, solve, monkeypatch):
     """A camera's yaw and a payload explain as much, each in channels of its own."""
-    problem = posed({"camera_yaw_rad": 0.01, "payload_ratio": 0.25}, ("camera_yaw", "payload", "gyro_scale"))
+    library = ("camera_yaw", "payload", "gyro_scale")
+    problem = posed({"camera_yaw_rad": 0.01, "payload_ratio": 0.25}, library, 40.0)
     fit, start, payload = solve(problem), problem.at(problem.simulation.vector), effect_named("payload")
     assert names(fit.causes) == {"camera_yaw", "payload"}
     # as if the yaw had been withdrawn

@@ -1,0 +1,137 @@
+"""Robots that lack what others have, and logs of the dynamic simulator, a richer model than the one under test."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from terrain.discrepancy.diagnose import diagnose
+from terrain.discrepancy.diagnosed_runs import diagnose_runs, simulation_for
+from terrain.discrepancy.health import candidate_changes
+from terrain.discrepancy.powertrain import traces_of
+from terrain.discrepancy.robot_terms import in_robot_terms, value_in_robot_terms
+from terrain.discrepancy.runs import signals_of
+from terrain.discrepancy.verdict import Value, Verdict
+from terrain.effects import CHANNELS, effect_named, library_of, vector_of
+from terrain.errors import DataError
+from terrain.estimation.estimate import enriched, estimate_run
+from terrain.extension import region_of
+from terrain.records import Label, RunLog
+from terrain.robots import load_robot
+from terrain.simulation.plants.planar import Ground, make_planar, planar_ground, replay
+from terrain.simulation.run import simulate, simulate_run
+from terrain.terramechanics.soil import load_soil
+
+AGRIMARO, HUSKY, CAR, MARMOTTE, PATAKO = map(
+    load_robot, ("agrimaro", "husky", "adap2e", "marmotte", "patako")
+)
+BARE = """name: mule
+drive: skid_steer
+wheel_radius_m: {value: 0.3, unit: m, source: me}
+track_m: {value: 1.08, unit: m, source: me}
+wheelbase_m: {value: 0.9, unit: m, source: assumed}
+mass_kg: {value: 280.0, unit: kg, source: me}
+"""
+WIDE = {"effective_track_ratio": 0.4}
+
+
+def test_a_robot_of_which_geometry_and_mass_are_known_is_replayed_explained_and_filtered(tmp_path):
+    """It turns as if its track were 40 % wider."""
+    path = tmp_path / "mule.yaml"
+    path.write_text(BARE)
+    robot = load_robot(path)
+    runs = [
+        simulate_run(robot, "asphalt", "complex", 0, i, duration_s=30.0, effects=WIDE) for i in range(1, 5)
+    ]
+    # two routes: the simulation that wrote the log, and its replay from the wheel speeds logged
+    signals = signals_of(runs[0], robot)
+    logged = (signals.wheel_speed_mps, signals.steer_rad, signals.grade_rad, signals.roll_rad)
+    # copies: read-only arrays would be another signature, for which nothing else compiles
+    copies = (values.copy() for values in logged)
+    seen = replay(make_planar(robot, Ground()), vector_of(WIDE), signals.dt_s, *copies)
+    column = CHANNELS.index("yaw_rate_radps")
+    assert np.std((signals.measured - seen)[50:-50, column]) < 0.03 < np.nanstd(signals.measured[:, column])
+    library = [effect_named("effective_track"), effect_named("lever_arm")]
+    (cause,) = diagnose_runs(runs, robot, library, None, 0).diagnosis.causes
+    assert (cause.name, cause.parameters[0].value) == ("effective_track", pytest.approx(0.4, abs=0.05))
+    assert np.isfinite(enriched(estimate_run(runs[0], robot, "skid")).streams["estimator"].values).all()
+
+
+def test_a_log_of_a_car_has_one_wheel_a_region_and_no_columns_to_exchange():
+    run = simulate(CAR, np.tile((1.0, 0.0, 0.2), (501, 1)), Ground(), 0)
+    region = region_of([run], CAR)
+    assert region.wheel_speed_mps[1] == pytest.approx(1.0, abs=1e-3)
+    assert region.yaw_rate_radps[1] == pytest.approx(0.2, abs=1e-3)
+    without = RunLog("a", CAR.name, {k: v for k, v in run.streams.items() if k != "steering"})
+    assert region_of([without], CAR).yaw_rate_radps is None
+    with pytest.raises(DataError, match="no stream 'steering'"):
+        signals_of(without, CAR)
+    assert all(change.wheel < 1 and change.pair == (0, 1) for change in candidate_changes(CAR))
+    assert traces_of([run] * 5, CAR)[0].measured.shape[1] == 1
+
+
+def test_words_are_those_of_the_robot():
+    radius = Value("wheel_radius_ratio", 0.05, "ratio", 0.045, 0.055)
+    assert in_robot_terms("wheel_radius", [radius], MARMOTTE).startswith(
+        "a sprocket radius of 0.1250 m (described"
+    )
+    assert "assumed" in in_robot_terms("wheel_radius", [radius], PATAKO)
+    side = Value("one_sided_radius_ratio", 0.05, "ratio", 0.045, 0.055)
+    assert in_robot_terms("one_sided_radius", [side], MARMOTTE).startswith("sprockets that are 5.0 % larger")
+    less = Value("understeer_s2pm", 0.03, "s2pm", 0.025, 0.035)
+    text = in_robot_terms("understeer", [less], CAR)
+    assert text == "an understeer of 0.030 s²/m (described: 0 s²/m), which turns it 9.1 % less at 2 m/s"
+    soft = value_in_robot_terms("cornering_stiffness_ratio", -0.2, -0.25, -0.15, CAR)
+    assert soft == "12000 N/rad (11250 to 12750)"
+
+
+# -- Logs of the dynamic simulator ---------------------------------------------------------------------------
+
+LIBRARY = library_of("swerve")
+
+
+def dynamic_runs(effects=None, robot=AGRIMARO, terrain="grass", n=6, **options):
+    return [simulate_run(robot, terrain, "survey", 0, i + 1, effects=effects, **options) for i in range(n)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("effects", "options"),
+    [
+        ({}, {}),
+        ({}, {"terrain": "firm_soil_gravel", "vary": True}),
+        ({"wheel_radius_ratio": 0.05}, {}),
+        ({"camera_latency_s": 0.1}, {}),
+        ({"payload_ratio": 0.3}, {}),
+    ],
+)
+def test_an_effect_hidden_in_the_plant_is_named_and_nothing_else(effects, options):
+    runs = dynamic_runs(effects, **options)
+    diagnosis = diagnose(runs, simulation_for(runs, AGRIMARO, LIBRARY)[0], LIBRARY)
+    assert diagnosis.values == {name: pytest.approx(value, rel=0.15) for name, value in effects.items()}
+    assert (diagnosis.ambiguous_sets, diagnosis.excluded_runs, diagnosis.faults) == ((), (), ())
+    if not effects:
+        assert diagnosis.verdict in (Verdict.NONE, Verdict.NOT_EXCITED)
+
+
+def test_a_run_is_simulated_on_the_soil_of_its_label_or_the_default_terrain():
+    runs = dynamic_runs(n=2, duration_s=10.0)
+    unknown = [replace(run, run_id=f"u{i}", labels=(Label(0.0, 5.0, "moon"),)) for i, run in enumerate(runs)]
+    several = replace(runs[0], run_id="s", labels=(Label(0.0, 5.0, "grass"), Label(5.0, 9.0, "snow")))
+    simulation, matches = simulation_for([*runs, *unknown, several], AGRIMARO, LIBRARY)
+    assert [match[:2] for match in matches] == [("", None), ("grass", "grass"), ("moon", None)]
+    soil = planar_ground(AGRIMARO, load_soil("grass"))
+    assert simulation.grounds["grass"]._replace(effective_ratio=1.0) == soil
+    on = [simulation.planar_on("grass"), simulation.planar_on("moon"), make_planar(AGRIMARO, Ground())]
+    grass, moon, plain = (planar.params.tobytes() for planar in on)
+    assert grass == make_planar(AGRIMARO, simulation.grounds["grass"]).params.tobytes() != plain
+    assert moon == simulation.planar.params.tobytes() == plain
+    assert simulation_for(unknown, AGRIMARO, LIBRARY)[0].grounds == {}
+
+
+@pytest.mark.parametrize(("robot", "effective"), [(AGRIMARO, 0.0), (HUSKY, 1.0)])
+def test_tilt_acts_as_a_slope_but_not_where_a_body_rides_over_bumps(robot, effective):
+    runs = dynamic_runs(robot=robot, n=2, vary=robot is HUSKY, duration_s=40.0)
+    simulation, _ = simulation_for(runs, robot, library_of(robot.drive))
+    assert simulation.grounds["grass"].effective_ratio == pytest.approx(effective, abs=0.05)
+    assert simulation.tilt_is_slope("grass") == (simulation.grounds["grass"].effective_ratio == 1.0)
