@@ -16,7 +16,7 @@ from pipelines.report.results import Result
 from pipelines.report.tree import Report
 from studies import consistency, figures, intervals, labels, long_drives, mutants, scale, trials
 from studies.__main__ import STUDIES, main
-from studies.blind_trials.hidden import Row
+from studies.blind_trials.trial import Row
 from terrain.errors import ConfigError, DataError
 from terrain.robots import load_robot
 

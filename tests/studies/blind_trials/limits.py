@@ -8,7 +8,7 @@ motion and from spectra of the simulated noise, not from anything that the diagn
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -39,7 +39,7 @@ from terrain.effects import (
 )
 from terrain.errors import ConfigError
 from terrain.kinematics.wheels import velocity_matrix
-from terrain.records import Array, RunLog, Stream
+from terrain.records import Array, Stream
 from terrain.robots import BicycleRobot, Robot, SwerveRobot
 from terrain.simulation.plants.planar import (
     CAMERA_HZ,
@@ -168,103 +168,75 @@ def limits_of(robot: Robot, drives: Drives, sensing: Sensing | None = None) -> L
         sensing = sensing._replace(channels=(GYRO, SPEED_X, SPEED_Y, ACCEL))  # no currents are logged
     robot = with_silent_parts(robot)
     planar, noise = make_planar(robot, Ground()), spread_numbers("noise")
-    scatter = sensing.scatter or spread_numbers("scatter")
-    names, nuisances = tuple(parameters_of(robot.drive)), nuisances_of(robot.drive)
-    every = tuple(dict.fromkeys((*names, *nuisances)))
-    free = [every.index(name) for name in nuisances]
-    std = np.array([scatter[every[i]] for i in free])
-    total = np.zeros((len(names), len(names)))
-    lead = round(drives.lead_s * STEP_HZ)
-    for twist, hills in zip(drives.twists, drives.hills, strict=True):
-        gram = _gram(
-            robot, planar, noise, simulate(robot, twist, Ground(), 0, conditions=hills), every, sensing, lead
-        )
-        inner = np.linalg.inv(gram[np.ix_(free, free)] + np.diag(1.0 / std**2))
-        left = gram - gram[:, free] @ inner @ gram[free]
-        total += left[: len(names), : len(names)]
-    return Limits(names, total)
-
-
-def _gram(
-    robot: Robot,
-    planar: Planar,
-    noise: Mapping[str, float],
-    run: RunLog,
-    names: Sequence[str],
-    sensing: Sensing,
-    lead: int,
-) -> Array:
-    """Return the information (k, k) of one run from a step on, nothing free."""
-    truth = run.streams["truth"]
-    even = slice(2 * lead, len(truth) // 100 * 100, 2)  # a length that its Fourier transform is quick with
-    truth = Stream(truth.time_s[even], truth.values[even], truth.channels)
-    rate_hz = truth.rate_hz
-    wheels = robot.wheels
-    wheel_speed = np.column_stack([truth.channel(f"wheel_{w}_radps") for w in wheels]) * robot.wheel_radius_m
-    steer = np.column_stack([truth.channel(f"steer_{w}_rad") for w in wheels])
-    grade, roll = (
-        sensing.tilt * sign * truth.channel(f"{axis}_rad") for axis, sign in (("pitch", -1.0), ("roll", 1.0))
-    )
-    wheel_speed, steer = np.ascontiguousarray(wheel_speed), np.ascontiguousarray(steer)
-    measured = np.ones((len(wheel_speed), len(CHANNELS)))
-    # the sum of currents measures traction only where wheels are parallel
-    measured[np.abs(np.exp(1j * steer).mean(axis=1)) < 0.95, CHANNELS.index(CURRENT)] = 0.0
     channels = sensing.channels or (GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT)
     if robot.skids and not sensing.channels:
         channels = (*channels, TURNING_CURRENT)
-    n = len(wheel_speed)
-    frequency_hz = np.fft.rfftfreq(n, 1 / rate_hz)
-    used = frequency_hz < sensing.cutoff_hz
-    f = frequency_hz[used]
-    both_sides = np.where(f > 0, 4.0, 2.0)
-    pace = _pace_mps(wheel_speed)
-    density = {name: _density(noise, robot, planar, name, f, pace) for name in channels}
-    waves = {name: np.empty((len(names), f.size), dtype=complex) for name in channels}
-    plain = move(planar, vector_of({}), 1 / rate_hz, wheel_speed, steer, grade, roll, np.zeros((0, 3)))
-    for j, name in enumerate(names):
-        step = STEPS[name]
-        both = []
-        for sign in (1.0, 0.0) if name in ONE_SIDED else (1.0, -1.0):
-            p = vector_of({name: sign * step})
-            if name in SENSED_ONLY:
-                both.append(sense(planar.body, p, 1 / rate_hz, plain))
-            else:
-                both.append(_predict(planar, p, 1 / rate_hz, wheel_speed, steer, grade, roll))
-        span = step if name in ONE_SIDED else 2 * step
-        change = (both[0] - both[1]) / span * measured
+    scatter = sensing.scatter or spread_numbers("scatter")
+    n_names, nuisances = len(parameters_of(robot.drive)), nuisances_of(robot.drive)
+    names = tuple(dict.fromkeys((*parameters_of(robot.drive), *nuisances)))
+    free = [names.index(name) for name in nuisances]
+    prior = np.diag(1.0 / np.array([scatter[names[i]] for i in free]) ** 2)
+    total = np.zeros((n_names, n_names))
+    for twist, hills in zip(drives.twists, drives.hills, strict=True):
+        truth = simulate(robot, twist, Ground(), 0, conditions=hills).streams["truth"]
+        # from the start of the log, of a length that its Fourier transform is quick with
+        even = slice(2 * round(drives.lead_s * STEP_HZ), len(truth) // 100 * 100, 2)
+        truth = Stream(truth.time_s[even], truth.values[even], truth.channels)
+        rate_hz, n = truth.rate_hz, len(truth)
+        wheel_speed, steer = (
+            np.ascontiguousarray(np.column_stack([truth.channel(name.format(w)) for w in robot.wheels]))
+            for name in ("wheel_{}_radps", "steer_{}_rad")
+        )
+        wheel_speed *= robot.wheel_radius_m
+        grade, roll = (
+            sensing.tilt * sign * truth.channel(f"{axis}_rad")
+            for axis, sign in (("pitch", -1.0), ("roll", 1.0))
+        )
+        measured = np.ones((n, len(CHANNELS)))
+        # the sum of currents measures traction only where wheels are parallel
+        measured[np.abs(np.exp(1j * steer).mean(axis=1)) < 0.95, CHANNELS.index(CURRENT)] = 0.0
+        frequency_hz = np.fft.rfftfreq(n, 1 / rate_hz)
+        used = frequency_hz < sensing.cutoff_hz
+        f = frequency_hz[used]
+        # the mean speed of the wheels while they turn; the least that counts if they do not
+        speed = np.abs(wheel_speed).mean(axis=1)
+        turning = speed[speed > TURNING_MPS]
+        pace_mps = float(turning.mean()) if turning.size else TURNING_MPS
+        plain = move(planar, vector_of({}), 1 / rate_hz, wheel_speed, steer, grade, roll, np.zeros((0, 3)))
+        changes = []
+        for name in names:
+            step, both = STEPS[name], []
+            for sign in (1.0, 0.0) if name in ONE_SIDED else (1.0, -1.0):
+                p, moved = vector_of({name: sign * step}), plain
+                if name not in SENSED_ONLY:
+                    # a replay of measured wheels and tilt, linear in lag and offsets
+                    lag = p[INDEX["encoder_lag_s"]]
+                    speeds = (
+                        wheel_speed + lag * np.gradient(wheel_speed, 1 / rate_hz, axis=0)
+                        if lag
+                        else wheel_speed
+                    )
+                    tilt = grade - p[INDEX["pitch_offset_rad"]], roll - p[INDEX["roll_offset_rad"]]
+                    moved = move(planar, p, 1 / rate_hz, speeds, steer, *tilt, np.zeros((0, 3)))
+                both.append(np.asarray(sense(planar.body, p, 1 / rate_hz, moved)))
+            changes.append((both[0] - both[1]) / (step if name in ONE_SIDED else 2 * step) * measured)
+        gram = np.zeros((len(names), len(names)))
         for channel in channels:
-            waves[channel][j] = np.fft.rfft(change[:, CHANNELS.index(channel)])[used] / rate_hz
-    gram = np.zeros((len(names), len(names)))
-    for channel in channels:
-        weighed = waves[channel] * (both_sides / density[channel] * rate_hz / n)
-        gram += np.real(weighed @ waves[channel].conj().T)
-    return gram
-
-
-def _pace_mps(wheel_speed: Array) -> float:
-    """Return the mean speed of the wheels while they turn; the least that counts if they do not."""
-    speed = np.abs(wheel_speed).mean(axis=1)
-    turning = speed[speed > TURNING_MPS]
-    return float(turning.mean()) if turning.size else TURNING_MPS
-
-
-def _predict(
-    planar: Planar, p: Array, dt: float, wheel_speed: Array, steer: Array, grade: Array, roll: Array
-) -> Array:
-    """Return the prediction of a replay of measured wheels and tilt, linear in lag and offsets."""
-    lag = p[INDEX["encoder_lag_s"]]
-    wheel_speeds = wheel_speed + lag * np.gradient(wheel_speed, dt, axis=0) if lag else wheel_speed
-    tilt = grade - p[INDEX["pitch_offset_rad"]], roll - p[INDEX["roll_offset_rad"]]
-    truth = move(planar, p, dt, wheel_speeds, steer, *tilt, np.zeros((0, 3)))
-    return np.asarray(sense(planar.body, p, dt, truth))
+            waves = np.fft.rfft([change[:, CHANNELS.index(channel)] for change in changes])[:, used] / rate_hz
+            density = _density(noise, robot, planar, channel, f, pace_mps)
+            weighed = waves * (np.where(f > 0, 4.0, 2.0) / density * rate_hz / n)
+            gram += np.real(weighed @ waves.conj().T)
+        left = gram - gram[:, free] @ np.linalg.inv(gram[np.ix_(free, free)] + prior) @ gram[free]
+        total += left[:n_names, :n_names]
+    return Limits(names[:n_names], total)
 
 
 def _density(
-    noise: Mapping[str, float], robot: Robot, planar: Planar, channel: str, f: Array, pace: float
+    noise: Mapping[str, float], robot: Robot, planar: Planar, channel: str, f: Array, pace_mps: float
 ) -> Array:
     """Return the one-sided spectrum of measured minus replayed: noise of channel and wheels."""
-    own = noise_psd(noise, robot, planar, channel, f, pace)
-    wheel_speed = noise_psd(noise, robot, planar, WHEEL_SPEED, f, pace)
+    own = noise_psd(noise, robot, planar, channel, f, pace_mps)
+    wheel_speed = noise_psd(noise, robot, planar, WHEEL_SPEED, f, pace_mps)
     lag_s = robot.completed.sensors.encoder_time_constant_s
     wheel_speed = wheel_speed * (1.0 + (2 * math.pi * f * lag_s) ** 2)  # the lag is undone
     body, n = planar.body[0], 1 if isinstance(robot, BicycleRobot) else len(robot.wheels)
@@ -332,7 +304,6 @@ def noise_psd(
     channel: str,
     frequency_hz: Array,
     speed_mps: float,
-    encoder_lag_s: float = 0.0,
 ) -> Array:
     """Return the one-sided density of the noise in a channel of a log at a steady speed, unit^2/Hz.
 
@@ -345,117 +316,70 @@ def noise_psd(
     channel : one of ``effects.CHANNELS``, or ``wheel_speed_mps`` (of one wheel), ``grade_rad`` or ``roll_rad``
     frequency_hz : from 0 to the logger's Nyquist frequency: 25 Hz, of the IMU's channels 50 Hz
     speed_mps : of the wheels
-    encoder_lag_s : beside the lag of the robot's description
 
     Raises
     ------
     ConfigError
         for another channel, or a robot without motors, camera or sensors.
     """
-    f = np.asarray(frequency_hz, dtype=np.float64)
-    model = _Spectra(noise, robot, planar, abs(speed_mps), float(activity(speed_mps, noise)), encoder_lag_s)
-    densities: dict[str, Callable[[Array], Array]] = {
-        GYRO: model.yaw_rate,
-        SPEED_X: model.speed_ahead,
-        SPEED_Y: model.speed_sideways,
-        ACCEL: model.accel,
-        CURRENT: model.current,
-        TURNING_CURRENT: model.turning_current,
-        WHEEL_SPEED: model.wheel_speed,
-        HEADING: model.heading_rate,
-        GRADE: model.tilt,
-        ROLL: model.tilt,
-    }
-    if channel not in densities:
-        raise ConfigError(f"noise of channel {channel!r} is not known")
-    return densities[channel](f)
+    f, pace_mps, body = np.asarray(frequency_hz, dtype=np.float64), abs(speed_mps), planar.body[0]
+    moving = float(activity(speed_mps, noise))
 
+    def shaking(name: str, unit: str, rate_hz: float) -> Array:
+        """Return the density of what is drawn while the robot moves."""
+        return coloured_psd(f, noise[f"{name}_{unit}"] * moving, noise[f"{name}_s"], rate_hz)
 
-def _folded(density: Callable[[Array], Array], f: Array) -> Array:
-    """Return the density of every second sample of a signal at the IMU's rate."""
-    return density(f) + density(IMU_HZ / 2.0 - f)
-
-
-class _Spectra(NamedTuple):
-    """Densities of the noise of one robot at a steady speed, each from frequencies (n,) to (n,).
-
-    ``moving`` is the activity of the noise at that speed, 0 to 1.
-    """
-
-    noise: Mapping[str, float]
-    robot: Robot
-    planar: Planar
-    speed_mps: float
-    moving: float
-    encoder_lag_s: float
-
-    def yaw_rate(self, f: Array) -> Array:
-        sensors, noise = self.robot.sensors, self.noise
-        vibration = coloured_psd(f, noise["gyro_radps"] * self.moving, noise["gyro_s"], IMU_HZ)
-        return self._turning(f, IMU_HZ) + vibration + white_psd(f, sensors.gyro_std_radps, IMU_HZ)
-
-    def speed_ahead(self, f: Array) -> Array:
-        turning = self._turning(f, CAMERA_HZ) * self.planar.body["lever_y_m"][0] ** 2
-        return self._seen(f) + _folded(self._along, f) + turning
-
-    def speed_sideways(self, f: Array) -> Array:
-        noise = self.noise
-        sideways = coloured_psd(f, noise["across_ratio"] * self.speed_mps, noise["across_s"], CAMERA_HZ)
-        return self._seen(f) + sideways + self._turning(f, CAMERA_HZ) * self.planar.body["lever_x_m"][0] ** 2
-
-    def accel(self, f: Array) -> Array:
-        sensors, noise = self.robot.sensors, self.noise
-        vibration = coloured_psd(f, noise["accel_mps2"] * self.moving, noise["accel_s"], IMU_HZ)
-        return vibration + self._along_rate(f) + white_psd(f, sensors.accel_std_mps2, IMU_HZ)
-
-    def current(self, f: Array) -> Array:
-        body = self.planar.body[0]
-        amps_per_accel = body["mass_kg"] * body["radius_m"] / body["nm_per_a"]
-        return self.turning_current(f) + amps_per_accel**2 * _folded(self._along_rate, f)
-
-    def turning_current(self, f: Array) -> Array:
-        robot, noise = self.robot, self.noise
-        drawn = coloured_psd(f, current_noise_a(noise, robot) * self.moving, noise["current_s"], WHEELS_HZ)
-        return drawn + white_psd(f, robot.sensors.current_std_a * math.sqrt(len(robot.wheels)), WHEELS_HZ)
-
-    def wheel_speed(self, f: Array) -> Array:
-        robot, motors, sensors = self.robot, self.robot.motors, self.robot.sensors
-        turns = sensors.hall_steps_ratio * motors.reduction_ratio
-        step_m = 2.0 * math.pi * robot.wheel_radius_m / turns if turns > 0.0 else 0.0
-        std_m = math.hypot(self.noise["encoder_m"] * self.moving, step_m / math.sqrt(12.0))
-        rate = white_psd(f, std_m, WHEELS_HZ) * (2.0 * np.sin(math.pi * f / WHEELS_HZ) * WHEELS_HZ) ** 2
-        rate = rate * lag_gain(f, sensors.encoder_time_constant_s + self.encoder_lag_s, WHEELS_HZ)
-        white_mps = sensors.motor_std_radps / motors.reduction_ratio * robot.wheel_radius_m
-        return np.asarray(rate + white_psd(f, white_mps, WHEELS_HZ))
-
-    def heading_rate(self, f: Array) -> Array:
-        angle = white_psd(f, self.noise["heading_rad"], CAMERA_HZ)
-        rate = angle * (np.sin(2.0 * math.pi * f / CAMERA_HZ) * CAMERA_HZ) ** 2
-        return np.asarray(rate + self._turning(f, CAMERA_HZ))
-
-    def tilt(self, f: Array) -> Array:
-        return white_psd(f, self.noise["tilt_rad"], IMU_HZ)
-
-    def _turning(self, f: Array, rate_hz: float) -> Array:
-        return coloured_psd(f, self.noise["yaw_radps"] * self.moving, self.noise["yaw_s"], rate_hz)
-
-    def _seen(self, f: Array) -> Array:
-        camera, noise = self.robot.camera, self.noise
-        vibration = coloured_psd(f, noise["camera_mps"] * self.moving, noise["camera_s"], CAMERA_HZ)
-        return vibration + white_psd(f, camera.speed_std_mps, CAMERA_HZ)
-
-    def _along(self, f: Array) -> Array:
+    def along(f: Array) -> Array:
         """Return the density of the speed ahead, at the IMU's rate."""
-        noise, slip_ratio = self.noise, self.planar.body["soft_ratio"][0, 0]
-        lag = self.speed_mps * slip_ratio / GRAVITY_MPS2
-        terrain = coloured_psd(f, noise["along_ratio"] * self.speed_mps, noise["along_s"], IMU_HZ)
-        if not isinstance(self.robot, SwerveRobot):
+        slip_ratio = body["soft_ratio"][0]
+        lag = pace_mps * slip_ratio / GRAVITY_MPS2
+        terrain = coloured_psd(f, noise["along_ratio"] * pace_mps, noise["along_s"], IMU_HZ)
+        if not isinstance(robot, SwerveRobot):
             return terrain * lag_gain(f, lag, IMU_HZ)
         w = 2.0 * math.pi * f  # a contact with a relaxation length swings
-        sprung = w**2 * self.robot.completed.body.relaxation_length_m * slip_ratio / GRAVITY_MPS2
+        sprung = w**2 * robot.completed.body.relaxation_length_m * slip_ratio / GRAVITY_MPS2
         return np.asarray(terrain / ((1.0 - sprung) ** 2 + (w * lag) ** 2))
 
-    def _along_rate(self, f: Array) -> Array:
+    def along_rate(f: Array) -> Array:
         """Return the density of its rate by differences as the simulation takes them, at the IMU's rate."""
         angle = 2.0 * math.pi * f / IMU_HZ
-        return self._along(f) * ((8.0 * np.sin(angle) - np.sin(2.0 * angle)) / 6.0 * IMU_HZ) ** 2
+        return along(f) * ((8.0 * np.sin(angle) - np.sin(2.0 * angle)) / 6.0 * IMU_HZ) ** 2
+
+    def folded(density: Callable[[Array], Array]) -> Array:
+        """Return the density of every second sample of a signal at the IMU's rate."""
+        return density(f) + density(IMU_HZ / 2.0 - f)
+
+    if channel == GYRO:
+        drawn = shaking("yaw", "radps", IMU_HZ) + shaking("gyro", "radps", IMU_HZ)
+        return drawn + white_psd(f, robot.sensors.gyro_std_radps, IMU_HZ)
+    if channel == HEADING:
+        angle = white_psd(f, noise["heading_rad"], CAMERA_HZ)
+        rate = angle * (np.sin(2.0 * math.pi * f / CAMERA_HZ) * CAMERA_HZ) ** 2
+        return np.asarray(rate + shaking("yaw", "radps", CAMERA_HZ))
+    if channel in (SPEED_X, SPEED_Y):
+        seen = shaking("camera", "mps", CAMERA_HZ) + white_psd(f, robot.camera.speed_std_mps, CAMERA_HZ)
+        turning = shaking("yaw", "radps", CAMERA_HZ)
+        if channel == SPEED_X:
+            return seen + folded(along) + turning * body["lever_y_m"] ** 2
+        sideways = coloured_psd(f, noise["across_ratio"] * pace_mps, noise["across_s"], CAMERA_HZ)
+        return seen + sideways + turning * body["lever_x_m"] ** 2
+    if channel == ACCEL:
+        drawn = shaking("accel", "mps2", IMU_HZ) + along_rate(f)
+        return drawn + white_psd(f, robot.sensors.accel_std_mps2, IMU_HZ)
+    if channel in (CURRENT, TURNING_CURRENT):
+        drawn = coloured_psd(f, current_noise_a(noise, robot) * moving, noise["current_s"], WHEELS_HZ)
+        drawn = drawn + white_psd(f, robot.sensors.current_std_a * math.sqrt(len(robot.wheels)), WHEELS_HZ)
+        amps_per_accel = body["mass_kg"] * body["radius_m"] / body["nm_per_a"]
+        return drawn if channel == TURNING_CURRENT else drawn + amps_per_accel**2 * folded(along_rate)
+    if channel == WHEEL_SPEED:
+        motors, sensors = robot.motors, robot.sensors
+        turns = sensors.hall_steps_ratio * motors.reduction_ratio
+        step_m = 2.0 * math.pi * robot.wheel_radius_m / turns if turns > 0.0 else 0.0
+        std_m = math.hypot(noise["encoder_m"] * moving, step_m / math.sqrt(12.0))
+        rate = white_psd(f, std_m, WHEELS_HZ) * (2.0 * np.sin(math.pi * f / WHEELS_HZ) * WHEELS_HZ) ** 2
+        rate = rate * lag_gain(f, sensors.encoder_time_constant_s, WHEELS_HZ)
+        white_mps = sensors.motor_std_radps / motors.reduction_ratio * robot.wheel_radius_m
+        return np.asarray(rate + white_psd(f, white_mps, WHEELS_HZ))
+    if channel in (GRADE, ROLL):
+        return white_psd(f, noise["tilt_rad"], IMU_HZ)
+    raise ConfigError(f"noise of channel {channel!r} is not known")

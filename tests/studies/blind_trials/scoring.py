@@ -9,19 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import beta
 
-from studies.blind_trials.hidden import DRIVE_ROWS, FAULTS, KNOWN, OUTSIDE, ROBOTS, Row, value_is_right
-from studies.blind_trials.trial import Trial
+from studies.blind_trials.trial import DRIVE_ROWS, FAULTS, KNOWN, OUTSIDE, ROBOTS, Row, Trial, value_is_right
 from terrain.discrepancy.verdict import Verdict
 from terrain.effects import library_of
 from terrain.records import Array
 
 FOUND_TRIALS = 5
 """Least number of trials of an effect, from which the amplitude at which it is found is fitted."""
-
-NAMED_ROWS = (
-    *(Row.GROSS, Row.SHORT, Row.LATE, Row.SCATTERED, Row.STALLED, Row.HALF, Row.SENSOR_LATE, Row.DYNAMIC),
-)
-"""Rows that resemble measured runs, with a bar on right names."""
 
 
 class Score(NamedTuple):
@@ -102,7 +96,8 @@ def _plain_scores(rows: Mapping[Row, Sequence[Trial]]) -> Iterator[tuple[str, Sc
 
 def _measured_scores(rows: Mapping[Row, Sequence[Trial]]) -> Iterator[tuple[str, Score]]:
     """Yield the scores of the rows that resemble measured runs."""
-    for row in (*NAMED_ROWS, Row.FAULT):
+    named_rows = Row.GROSS, Row.SHORT, Row.LATE, Row.SCATTERED, Row.STALLED, Row.HALF, Row.SENSOR_LATE
+    for row in (*named_rows, Row.DYNAMIC, Row.FAULT):
         name, least = ("stated in words", 0.95) if row is Row.FAULT else ("right or its twin set", 0.85)
         yield f"{row.value}: {name}", score(map(is_right, rows[row]), least)
         wrong = (bool(wrong_names(t)) for t in rows[row])
@@ -120,8 +115,11 @@ def _measured_scores(rows: Mapping[Row, Sequence[Trial]]) -> Iterator[tuple[str,
     yield "stalled: all stalled runs excluded", score(set(t.stalled) <= set(t.excluded) for t in stalled)
     others = score(bool(set(t.excluded) - set(t.stalled)) for t in stalled)
     yield "stalled: another run excluded", others
-    varying = (t for t in rows[Row.HALF] if varies(t, t.causes[0]))
-    yield "half: groups of runs are right", score(map(groups_are_right, varying))
+    right = []  # the runs with the effect are a group of their own
+    for trial in (t for t in rows[Row.HALF] if varies(t, t.causes[0])):
+        of_cause = [each for each in trial.varying if {each.name, *each.rivals} & {*trial.causes}]
+        right.append(any({*ids} == {*trial.present} for each in of_cause for _, ids in each.groups))
+    yield "half: groups of runs are right", score(right)
     late = rows[Row.SENSOR_LATE]
     for sensor in dict.fromkeys(t.variant for t in late):
         yield f"sensor_late, {sensor}: right", score(is_right(t) for t in late if t.variant == sensor)
@@ -133,11 +131,11 @@ def _measured_scores(rows: Mapping[Row, Sequence[Trial]]) -> Iterator[tuple[str,
     inside = (is_covered(t) for t in hidden if t.found(t.causes[0]))
     yield "dynamic, wheel radius: true value inside", score(inside, least=0.9)
     for known in KNOWN:
-        some = [t for t in rows[Row.KNOWN] if t.variant == known.name]
+        some = [t for t in rows[Row.KNOWN] if t.variant == known]
         named = score((t.found(t.causes[0]) and value_is_right(t.intervals) for t in some), least=0.9)
-        yield f"known, {known.name}: named, value within 5 %", named
+        yield f"known, {known}: named, value within 5 %", named
         wrong = score((bool(wrong_names(t)) for t in some), most=0.01)
-        yield f"known, {known.name}: a wrong single name", wrong
+        yield f"known, {known}: a wrong single name", wrong
 
 
 def _all_found(trial: Trial) -> bool:
@@ -190,20 +188,13 @@ def is_covered(trial: Trial) -> bool:
     )
 
 
-def groups_are_right(trial: Trial) -> bool:
-    """Return whether the runs with the effect are a group of their own."""
-    return any(
-        {each.name, *each.rivals} & set(trial.causes) and set(ids) == set(trial.present)
-        for each in trial.varying
-        for _, ids in each.groups
-    )
-
-
 def found_from(trials: Sequence[Trial]) -> dict[str, dict[str, float]]:
     """Return, by robot and effect, the amplitude over the limit from which nine in ten are found.
 
     A logistic curve in the logarithm of the amplitude is fitted to the trials of row ``found``.
     """
+    from scipy.optimize import minimize
+
     out: dict[str, dict[str, float]] = {}
     for robot in ROBOTS:
         own = [t for t in trials if t.row == Row.FOUND and t.robot == robot]
@@ -212,19 +203,17 @@ def found_from(trials: Sequence[Trial]) -> dict[str, dict[str, float]]:
             if len(some) >= FOUND_TRIALS:
                 over = np.log([t.over_limit for t in some])
                 hit = np.array([t.found(effect.name) for t in some])
-                out.setdefault(robot, {})[effect.name] = _ninety_percent_point(over, hit)
+
+                def loss(theta: Array, over: Array = over, hit: Array = hit) -> float:
+                    """Return that of a logistic curve; a weak prior keeps it finite."""
+                    steep = math.exp(min(theta[1], 5.0))
+                    p = 1 / (1 + np.exp(-np.clip(steep * (over - theta[0]), -500, 500)))
+                    p = np.clip(p, 1e-9, 1 - 1e-9)
+                    prior = 0.5 * (theta[1] - math.log(6.0)) ** 2 + 0.5 * (theta[0] / 2.0) ** 2
+                    return float(-(np.log(p[hit]).sum() + np.log(1 - p[~hit]).sum()) + prior)
+
+                theta = minimize(loss, np.array([0.3, math.log(6.0)]), method="Nelder-Mead").x
+                # where it reaches 0.9
+                at = float(math.exp(theta[0] + math.log(9.0) / math.exp(theta[1])))
+                out.setdefault(robot, {})[effect.name] = at
     return out
-
-
-def _ninety_percent_point(x: Array, hit: Array) -> float:
-    """Return the amplitude at which a logistic curve reaches 0.9; a weak prior keeps it finite."""
-    from scipy.optimize import minimize
-
-    def loss(theta: Array) -> float:
-        steep = math.exp(min(theta[1], 5.0))
-        p = np.clip(1 / (1 + np.exp(-np.clip(steep * (x - theta[0]), -500, 500))), 1e-9, 1 - 1e-9)
-        prior = 0.5 * (theta[1] - math.log(6.0)) ** 2 + 0.5 * (theta[0] / 2.0) ** 2
-        return float(-(np.log(p[hit]).sum() + np.log(1 - p[~hit]).sum()) + prior)
-
-    theta = minimize(loss, np.array([0.3, math.log(6.0)]), method="Nelder-Mead").x
-    return float(math.exp(theta[0] + math.log(9.0) / math.exp(theta[1])))

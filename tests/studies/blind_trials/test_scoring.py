@@ -7,9 +7,19 @@ from types import SimpleNamespace
 import pytest
 from scipy.stats import binomtest
 
-from studies.blind_trials.hidden import OUTSIDE, TRACK, TRACK_RATIO, Row, Statement, cases_of
 from studies.blind_trials.scoring import FOUND_TRIALS, found_from, is_right, score, table_of, wrong_names
-from studies.blind_trials.trial import CLOCK_STATED_S, Trial, Varying, run_trial
+from studies.blind_trials.trial import (
+    CLOCK_STATED_S,
+    OUTSIDE,
+    TRACK,
+    TRACK_RATIO,
+    Row,
+    Statement,
+    Trial,
+    Varying,
+    cases_of,
+    run_trial,
+)
 from terrain.discrepancy.health import Column, FaultKind
 from terrain.discrepancy.verdict import Clock, RunGroup, Value, Verdict
 

@@ -2,16 +2,27 @@
 
 import doctest
 import math
+from functools import cache
 from importlib import import_module
-from itertools import count
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
-from studies.blind_trials.drives import LEAD_S, command_drives, poor_drives, rich_drives
-from studies.blind_trials.hidden import (
+from studies.blind_trials.drives import (
+    CAR_MPS2,
+    LEAD_S,
+    STEP_HZ,
+    car_drives,
+    command_drives,
+    poor_drives,
+    rich_drives,
+)
+from studies.blind_trials.limits import POWER, TEST_SIZE, Limits, limits_of
+from studies.blind_trials.scoring import table_of
+from studies.blind_trials.trial import (
     CREEP_RATIO,
+    GROSS,
     KNOWN,
     N_STALLED,
     SHORT_RUNS,
@@ -27,13 +38,11 @@ from studies.blind_trials.hidden import (
     dynamic_runs,
     faults_of,
     hidden_runs,
-    setting_of,
+    run_trial,
+    simulation_of,
+    stage_of,
     value_is_right,
-    with_fault,
 )
-from studies.blind_trials.limits import POWER, TEST_SIZE, Limits, limits_of
-from studies.blind_trials.scoring import table_of
-from studies.blind_trials.trial import GROSS, run_trial, simulation_of, stage_of
 from terrain.discrepancy.diagnose import POWER_Z, diagnose
 from terrain.discrepancy.evidence import Z_EFFECT
 from terrain.discrepancy.verdict import Verdict
@@ -41,16 +50,19 @@ from terrain.effects import BOUNDS, effect_named, library_of
 from terrain.errors import DataError
 from terrain.robots import load_robot
 
-HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
+HUSKY, AGRIMARO, CAR = map(load_robot, ("husky", "agrimaro", "adap2e"))
 NEW_ROWS = list(Row)[list(Row).index(Row.GROSS) :]
 RATE_HZ = 50.0  #: Of the clock on which streams are compared
 
 
-def stage(row, number, n_runs=4, seed=0):
+def staged(row, number, n_runs=3, seed=0):
     """Return a trial before the diagnosis; odd numbers are of the skid-steer robot where a row has both."""
-    case = cases_of(row, number + 1, seed, n_runs)[number]
+    case = cases_of(row, number + 1, seed, n_runs)[number]._replace(n_runs=n_runs)
     drawn, noise = np.random.SeedSequence([seed, number]).spawn(2)
     return stage_of(case, load_robot(case.robot), np.random.default_rng(drawn), noise)
+
+
+stage = cache(staged)
 
 
 def turn(wheels):
@@ -73,9 +85,8 @@ def slope(x, y):
 def on_clock(run, name, signal):
     """Return a signal of a stream on a clock of its run's own."""
     first, last = (end(s.time_s[i] for s in run.streams.values()) for end, i in ((max, 0), (min, -1)))
-    return np.interp(
-        np.arange(first, last, 1.0 / RATE_HZ), run.streams[name].time_s, signal(run.streams[name])
-    )
+    time_s = np.arange(first, last, 1.0 / RATE_HZ)
+    return np.interp(time_s, run.streams[name].time_s, signal(run.streams[name]))
 
 
 def median_lag_s(runs, late, reference):
@@ -89,19 +100,15 @@ def median_lag_s(runs, late, reference):
 
 
 @pytest.mark.parametrize(
-    "row",
-    [
-        pytest.param(row, marks=[pytest.mark.slow] * (row in ("dynamic", "short", "known")))
-        for row in NEW_ROWS
-    ],
+    "row", [pytest.param(row, marks=[pytest.mark.slow] * (row == "dynamic")) for row in NEW_ROWS]
 )
 def test_the_same_seed_gives_the_same_trial_and_nothing_of_the_truth_leaks(row):
-    made, again, other = (stage(row, 1, seed=seed) for seed in (0, 0, 1))
-    one, two, three = (
+    made, again = stage(row, 1), staged(row, 1)
+    one, two = (
         [part.tobytes() for run in s.runs for x in run.streams.values() for part in (x.time_s, x.values)]
-        for s in (made, again, other)
+        for s in (made, again)
     )
-    assert one == two != three
+    assert one == two
     assert made.hidden == again.hidden
     assert made.simulation is not None
     assert not any("truth" in run.streams or run.source for run in made.runs)
@@ -111,7 +118,7 @@ def test_the_same_seed_gives_the_same_trial_and_nothing_of_the_truth_leaks(row):
 @pytest.mark.slow
 def test_gross_effects_are_20_to_100_times_their_limit_unless_that_is_beyond_the_bounds():
     clipped = []
-    for number in range(12):
+    for number in range(8):
         made = stage(Row.GROSS, number)
         assert GROSS[0] <= made.hidden.over_limit <= GROSS[1]
         effect = effect_named(made.hidden.causes[0])
@@ -125,8 +132,8 @@ def test_gross_effects_are_20_to_100_times_their_limit_unless_that_is_beyond_the
 
 
 def test_short_runs_are_commands_of_6_s_in_the_drive_layout():
-    runs = stage(Row.SHORT, 0).runs
-    assert len(runs) == SHORT_RUNS
+    assert {case.n_runs for case in cases_of(Row.SHORT, 2, 0, 4)} == {SHORT_RUNS}
+    runs = stage(Row.SHORT, 0, n_runs=16).runs
     for run in runs:
         assert set(run.streams) == {"wheels", "imu", "lidar"}
         for stream in run.streams.values():
@@ -135,36 +142,32 @@ def test_short_runs_are_commands_of_6_s_in_the_drive_layout():
             assert stream.duration_s == pytest.approx(6.0, abs=0.2)
             assert stream.time_s[0] == 0.0
     wheels = [run.streams["wheels"].values for run in runs]
-    assert (
-        np.median([x[60:].std(axis=0).max() for x in wheels]) < 0.02
-    )  # one command is held for the second half
-    assert np.std([x[60:].mean() for x in wheels]) > 0.3  # and differs from run to run
+    # one command is held for the second half, and differs from run to run
+    assert np.median([x[60:].std(axis=0).max() for x in wheels]) < 0.02
+    assert np.std([x[60:].mean() for x in wheels]) > 0.3
     assert np.median([abs(x[0]).max() for x in wheels]) > 0.2  # a run begins at the command before
 
 
-@pytest.mark.parametrize("number", [1, 3])
-def test_a_late_logger_is_late_by_what_is_stated(number):
+def test_a_late_logger_or_sensor_is_late_by_what_is_stated_and_no_other_is():
     """Wheels that are stamped late see a turn after the gyro, an IMU that is stamped late before it."""
-    made = stage(Row.LATE, number)
-    late_s = made.asked["late_s"]
-    assert (late_s < 0) == (made.asked["variant"] == "wheels")
-    assert 0.15 <= abs(late_s) <= 0.4
-    assert median_lag_s(made.runs, ("imu", gyro), ("wheels", turn)) == pytest.approx(late_s, abs=0.05)
-    assert made.hidden.causes[0] == "clock_offset"
-    assert len(made.hidden.causes) == 2
-
-
-@pytest.mark.parametrize("number", [1, 3, 5])
-def test_one_sensor_is_late_and_the_others_are_not(number):
-    made = stage(Row.SENSOR_LATE, number)
-    (late_s,), sensor = made.hidden.effects.values(), made.asked["variant"]
-    assert 0.1 <= late_s <= 0.3
-    seen = "lidar" if sensor == "lidar" else "odometry"
-    gyro_s = median_lag_s(made.runs, ("imu", gyro), ("wheels", turn))
-    seen_s = median_lag_s(made.runs, (seen, lambda s: s.channel("speed_x_mps")), ("wheels", ahead))
-    assert gyro_s == pytest.approx(late_s * (sensor == "gyro"), abs=0.03)
-    assert seen_s == pytest.approx(HUSKY.camera.latency_s + late_s * (sensor != "gyro"), abs=0.04)
-    assert made.hidden.causes[0].endswith("_latency")
+    for number in (1, 3):
+        made = stage(Row.LATE, number)
+        late_s = made.asked["late_s"]
+        assert (late_s < 0) == (made.asked["variant"] == "wheels")
+        assert 0.15 <= abs(late_s) <= 0.4
+        assert median_lag_s(made.runs, ("imu", gyro), ("wheels", turn)) == pytest.approx(late_s, abs=0.05)
+        assert made.hidden.causes[0] == "clock_offset"
+        assert len(made.hidden.causes) == 2
+    for number in (1, 3, 5):
+        made = stage(Row.SENSOR_LATE, number)
+        (late_s,), sensor = made.hidden.effects.values(), made.asked["variant"]
+        assert 0.1 <= late_s <= 0.3
+        seen = "lidar" if sensor == "lidar" else "odometry"
+        gyro_s = median_lag_s(made.runs, ("imu", gyro), ("wheels", turn))
+        seen_s = median_lag_s(made.runs, (seen, lambda s: s.channel("speed_x_mps")), ("wheels", ahead))
+        assert gyro_s == pytest.approx(late_s * (sensor == "gyro"), abs=0.03)
+        assert seen_s == pytest.approx(HUSKY.camera.latency_s + late_s * (sensor != "gyro"), abs=0.04)
+        assert made.hidden.causes[0].endswith("_latency")
 
 
 @pytest.mark.slow
@@ -181,8 +184,8 @@ def test_scatter_has_the_size_that_is_stated():
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_stalled_runs_do_not_move_and_their_wheels_turn(number):
-    made = stage(Row.STALLED, number, n_runs=8)
-    assert 1 <= len(made.asked["stalled"]) <= 2
+    made = stage(Row.STALLED, number)
+    assert len(made.asked["stalled"]) == 1
     for run in made.runs:
         odometry, wheels = run.streams["odometry"], run.streams["wheels"]
         names = [n for n in odometry.channels if n in ("speed_x_mps", "position_x_m", "position_y_m")]
@@ -191,10 +194,8 @@ def test_stalled_runs_do_not_move_and_their_wheels_turn(number):
             moved = np.diff(moved[:, ::10], axis=1) * 5.0
         speeds = wheels.values[:, [n.startswith(("speed", "motor")) for n in wheels.channels]]
         per = 1.0 if number else AGRIMARO.wheel_radius_m / AGRIMARO.motors.reduction_ratio
-        driven, speed = (
-            float(np.sqrt((speeds**2).mean())) * per,
-            float(np.sqrt((moved**2).sum(axis=0).mean())),
-        )
+        driven = float(np.sqrt((speeds**2).mean())) * per
+        speed = float(np.sqrt((moved**2).sum(axis=0).mean()))
         assert driven > 0.2
         is_stalled = run.run_id in made.asked["stalled"]
         assert speed < 2 * CREEP_RATIO[1] * driven + 0.02 if is_stalled else speed > 0.25 * driven
@@ -202,7 +203,8 @@ def test_stalled_runs_do_not_move_and_their_wheels_turn(number):
 
 @pytest.mark.slow
 def test_half_of_the_runs_have_the_effect_and_the_others_have_none():
-    made = next(s for n in count(1, 2) if (s := stage(Row.HALF, n)).hidden.causes == ("gyro_bias",))
+    numbers = range(1, 99, 2)
+    made = next(s for n in numbers if (s := stage(Row.HALF, n)).hidden.causes == ("gyro_bias",))
     (bias,), present = made.hidden.effects.values(), made.asked["present"]
     assert len(present) == len(made.runs) // 2
     for run in made.runs:
@@ -215,7 +217,7 @@ def test_half_of_the_runs_have_the_effect_and_the_others_have_none():
 def test_a_larger_wheel_carries_the_dynamic_robot_further():
     travelled = []
     for effects in ({}, {"wheel_radius_ratio": 0.03}):
-        (run,) = dynamic_runs(AGRIMARO, setting_of(2), 7, 1, effects)
+        (run,) = dynamic_runs(AGRIMARO, "starts", False, 7, 1, effects)
         seen, wheels = run.streams["odometry"], run.streams["wheels"]
         assert "truth" not in run.streams
         path = np.column_stack([seen.channel(f"position_{axis}_m") for axis in "xy"])[::40]
@@ -228,19 +230,21 @@ def test_a_larger_wheel_carries_the_dynamic_robot_further():
     "number", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in range(1, len(KNOWN)))]
 )
 def test_the_known_truth_is_in_the_logs(number):
-    known, made = KNOWN[number], stage(Row.KNOWN, number)
-    stalled, late_s, slopes = made.asked["stalled"], WHEELS_LATE_S if known.late else 0.0, []
-    assert (made.asked["variant"], len(stalled)) == (known.name, N_STALLED if known.stalled else 0)
+    name, beside = [*KNOWN.items()][number]
+    made = stage(Row.KNOWN, number, n_runs=60 if number else 16)
+    stalled, late_s, slopes = made.asked["stalled"], WHEELS_LATE_S * ("late" in beside), []
+    assert (made.asked["variant"], len(stalled)) == (name, N_STALLED * ("stalled" in beside))
     for run in made.runs:
         wheels, imu, lidar = (run.streams[name] for name in ("wheels", "imu", "lidar"))
         asked = np.interp(imu.time_s, wheels.time_s - late_s, turn(wheels))
         if run.run_id not in stalled and np.std(asked) + abs(asked.mean()) > 0.5:
             slopes.append(slope(asked, gyro(imu)))
-        if known.stalled and np.std(turn(wheels)) >= 0.1:
+        if "stalled" in beside and np.std(turn(wheels)) >= 0.1:
             still = abs(slope(turn(wheels), lidar.channel("yaw_rate_radps"))) < 0.05
             assert still == (run.run_id in stalled)
-    scatter = math.hypot(TRACK_SCATTER if known.scatters else 0.0, 0.008)
-    assert np.median(slopes) == pytest.approx(1 / (1 + TRACK_ERROR), rel=0.06 if known.scatters else 0.03)
+    scatters = "scatter" in beside
+    scatter = math.hypot(TRACK_SCATTER * scatters, 0.008)
+    assert np.median(slopes) == pytest.approx(1 / (1 + TRACK_ERROR), rel=0.06 if scatters else 0.03)
     assert np.std(np.log(slopes)) == pytest.approx(scatter, rel=0.35, abs=0.02)
 
 
@@ -259,7 +263,7 @@ def test_what_is_free_costs_the_information_that_the_inverse_has_not():
 
 @pytest.fixture(scope="module", params=[HUSKY, AGRIMARO], ids=["husky", "agrimaro"])
 def world(request):
-    drives = rich_drives(np.random.default_rng(1), 6, 40.0)
+    drives = rich_drives(np.random.default_rng(1), 4, 30.0)
     return request.param, drives, limits_of(request.param, drives)
 
 
@@ -288,8 +292,8 @@ def test_the_cramer_rao_limit_and_the_diagnosis_agree_on_what_can_be_seen(world)
 
 def test_limits_fall_with_more_runs_and_rise_where_little_is_driven(world):
     robot, drives, limits = world
-    half = limits_of(robot, drives._replace(twists=drives.twists[:3], hills=drives.hills[:3]))
-    poor = limits_of(robot, poor_drives(np.random.default_rng(1), 3, 40.0))
+    half = limits_of(robot, drives._replace(twists=drives.twists[:2], hills=drives.hills[:2]))
+    poor = limits_of(robot, poor_drives(np.random.default_rng(1), 2, 30.0))
     for effect in library_of(robot.drive):
         assert limits.of(effect) < half.of(effect) or effect.modifies
     shown = effect_named("steering_delay" if robot is AGRIMARO else "turning_slip")
@@ -335,16 +339,6 @@ def test_a_clock_that_drifts_starts_with_the_log():
 # -- Which effects a trial may hide together ---------------------------------------------------------------
 
 
-def test_two_effects_that_a_third_can_stand_for_are_known(world):
-    """Equal latencies of IMU and camera are a clock offset; a payload is neither."""
-    robot, _, limits = world
-    pair = effect_named("imu_latency"), effect_named("camera_latency")
-    if robot is HUSKY:
-        assert limits.spanned(pair, effect_named("clock_offset"))
-        assert not limits.spanned(pair, effect_named("payload"))
-        assert not limits.alike(pair[0], effect_named("clock_offset"))
-
-
 @pytest.mark.parametrize("least", [0.0, 1e-320, 1e-12])
 def test_an_effect_that_drives_hardly_show_is_like_none_that_they_show(least):
     payload, drag, scrub = effects = [effect_named(name) for name in ("payload", "turn_drag", "scrub")]
@@ -354,7 +348,7 @@ def test_an_effect_that_drives_hardly_show_is_like_none_that_they_show(least):
     assert not limits.spanned((payload, drag), scrub)
 
 
-def test_a_run_that_stands_shows_little_and_spoils_nothing():
+def test_a_run_that_stands_shows_little_and_spoils_nothing_and_equal_latencies_are_a_clock_offset():
     """One command of eighty may be next to none."""
     drives = command_drives(np.random.default_rng(0), HUSKY, 3)
     standing = tuple(np.zeros_like(twist) if i == 1 else twist for i, twist in enumerate(drives.twists))
@@ -362,13 +356,34 @@ def test_a_run_that_stands_shows_little_and_spoils_nothing():
     limits, radius = limits_of(HUSKY, drives._replace(twists=standing)), effect_named("wheel_radius")
     assert np.isfinite(limits.information).all()
     assert limits.part(radius, radius) == pytest.approx(moved.part(radius, radius), rel=1e-3)
+    pair = effect_named("imu_latency"), effect_named("camera_latency")
+    assert limits.spanned(pair, effect_named("clock_offset"))
+    assert not limits.spanned(pair, effect_named("payload"))
+    assert not limits.alike(pair[0], effect_named("clock_offset"))
+
+
+def test_drives_of_a_car_keep_to_what_it_can_and_part_stiffness_from_a_slide_on_side_slopes():
+    drives = car_drives(np.random.default_rng(0), CAR, 3, 60.0)
+    for twist in drives.twists:
+        speed, turn = twist[:, 0], twist[:, 2]
+        assert speed.min() < 0.0 < 1.5 < speed.max() <= 0.5 * CAR.speed_max_mps
+        assert not twist[-1].any()
+        assert np.abs(np.diff(speed)).max() * STEP_HZ <= CAR_MPS2 + 1e-9
+        curvature = turn[speed != 0.0] / speed[speed != 0.0]
+        assert np.abs(curvature).max() < np.tan(CAR.steering_max_rad) / CAR.wheelbase_m
+    limits = limits_of(CAR, drives)
+    stiffness, slide = effect_named("cornering_stiffness"), effect_named("side_hill_slip")
+    assert not limits.alike(stiffness, slide)
+    for over, explained in ((3.0, False), (0.01, True)):
+        hidden = {"cornering_stiffness_ratio": over * limits.of(stiffness)}
+        assert limits.in_place_of(stiffness, hidden, slide) == explained
 
 
 # -- A robot of known truth in short runs, and one of which nothing is wrong -------------------------------
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", range(len(KNOWN)), ids=[known.name for known in KNOWN])
+@pytest.mark.parametrize("number", [0, len(KNOWN) - 1], ids=["plain", "all"])
 def test_a_track_that_is_two_and_a_half_times_as_wide_is_named_in_short_runs(number):
     trial = run_trial(Case(Row.KNOWN, number, "husky", SHORT_RUNS, 0))
     assert TRACK in trial.named
@@ -376,19 +391,18 @@ def test_a_track_that_is_two_and_a_half_times_as_wide_is_named_in_short_runs(num
     assert value_is_right(trial.intervals)
     _, low, high = trial.intervals[TRACK_RATIO]
     # the mean of runs that scatter is no constant to be met
-    assert low < TRACK_ERROR < high or KNOWN[number].scatters
+    assert low < TRACK_ERROR < high or number > 0
     assert set(trial.stalled) <= set(trial.excluded)
     assert len(trial.excluded) <= len(trial.stalled) + 1
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_short_runs_in_which_nothing_is_hidden_have_no_cause(seed):
-    drives = command_drives(np.random.default_rng(seed), HUSKY, SHORT_RUNS)
-    runs = hidden_runs(HUSKY, drives, np.random.SeedSequence(seed), {}, heading=True)
+def test_short_runs_in_which_nothing_is_hidden_have_no_cause():
+    drives = command_drives(np.random.default_rng(0), HUSKY, 16)
+    runs = hidden_runs(HUSKY, drives, np.random.SeedSequence(0), {}, heading=True)
     answer = diagnose(tuple(map(as_command_log, runs)), simulation_of(HUSKY))
     assert answer.verdict in (Verdict.NONE, Verdict.NOT_EXCITED)
     assert (answer.causes, answer.ambiguous_sets, answer.varying, answer.faults) == ((), (), (), ())
-    assert len(answer.excluded_runs) <= 3  # a command may leave a wheel as fast as the one before
+    assert len(answer.excluded_runs) <= 1  # a command may leave a wheel as fast as the one before
 
 
 # -- Faults written into logs: each is in the log, on the robots that show it --------------------------------
@@ -408,7 +422,7 @@ def test_a_fault_changes_its_channels_and_no_others_by_what_its_name_states(robo
     channels = {"imu": "gyro_z_radps", "odometry": "speed_x_mps", "wheels": robot.rate_channels[0]}
     every = [(name, channel) for name, stream in run.streams.items() for channel in stream.channels]
     for fault in faults_of(robot.drive):
-        (broken,) = with_fault([run], fault, robot)
+        broken = fault.written(run, robot)
         values = {at: [r.streams[at[0]].channel(at[1]) for r in (run, broken)] for at in every}
         changed = [at for at, (before, after) in values.items() if not np.array_equal(before, after)]
         assert {name for name, _ in changed} == {fault.stream}
@@ -431,6 +445,6 @@ def test_refused_runs_count_as_a_false_alarm(monkeypatch):
     assert table_of([trial])["none: false alarms"].hits == 1
 
 
-@pytest.mark.parametrize("name", ["drives", "hidden", "limits", "scoring", "trial"])
+@pytest.mark.parametrize("name", ["drives", "limits", "scoring", "trial"])
 def test_examples_in_docstrings_hold(name):
     assert doctest.testmod(import_module(f"studies.blind_trials.{name}")).failed == 0

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from studies.blind_trials.drives import car_drives, rich_drives
-from studies.blind_trials.hidden import hidden_runs
+from studies.blind_trials.trial import hidden_runs
 from studies.blind_trials.limits import confusable_class, limits_of
 from studies.blind_trials.trial import simulation_of
 
