@@ -16,17 +16,9 @@ def simulated(i, robot=HUSKY, effects=HIDDEN, terrain="field"):
     ahead = 0.5 * np.sin(0.6 * time_s + i) + 0.2 * np.sin(1.9 * time_s)
     twist = np.column_stack([ahead, np.zeros_like(ahead), 0.5 * np.sin(0.9 * time_s + 0.3 * i)])
     twist[:50] *= np.linspace(0, 1, 50)[:, None]
-    about = {"run_id": f"{robot.name}_{i}", "terrain": terrain}
-    return simulate(
-        robot,
-        twist,
-        Ground(),
-        i,
-        effects=effects,
-        scatter=spread_numbers("scatter"),
-        noise=spread_numbers("noise"),
-        **about,
-    )
+    about = {"run_id": f"{robot.name}_{i}", "terrain": terrain, "effects": effects}
+    spreads = {name: spread_numbers(name) for name in ("scatter", "noise")}
+    return simulate(robot, twist, Ground(), i, **about, **spreads)
 
 
 @pytest.fixture(scope="session")
