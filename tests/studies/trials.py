@@ -14,9 +14,8 @@ from pydantic import field_validator
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import JobsSettings, Names, setting
 from pipelines.report.tree import Column, Report, Table, Text
-from studies.blind_trials.trial import Case, Row, cases_of
 from studies.blind_trials.scoring import FOUND_TRIALS, Score, found_from, table_of
-from studies.blind_trials.trial import Trial, run_trial
+from studies.blind_trials.trial import Case, Row, Trial, cases_of, run_trial
 from terrain.discrepancy.diagnose import MIN_RUNS
 from terrain.errors import ConfigError
 

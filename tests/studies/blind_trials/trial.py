@@ -734,13 +734,13 @@ def _with_known_scatter(draw: Draw) -> Stage:
     if case.row is Row.TWO:
         alike = confusable_class(limits, effect, draw.robot.drive) | {name for name, _ in effect.twins}
 
-        def can_be_told(other: Effect) -> bool:
+        def is_distinct(other: Effect) -> bool:
             """Return whether no third effect can take the place of one of the two."""
             pair = effect, other
             rest = [e for e in acting if e not in pair and not any(limits.alike(one, e) for one in pair)]
             return not any(limits.spanned(pair, third) for third in rest)
 
-        others = [other for other in acting if other.name not in alike and can_be_told(other)]
+        others = [other for other in acting if other.name not in alike and is_distinct(other)]
         causes.append(others[int(rng.integers(len(others)))])
         values |= values_of(causes[1], limits, over, rng)
     hidden = Hidden(library, values, tuple(cause.name for cause in causes), over)

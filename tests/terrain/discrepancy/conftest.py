@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 from studies.blind_trials.drives import rich_drives
-from studies.blind_trials.trial import hidden_runs
-from studies.blind_trials.trial import simulation_of
+from studies.blind_trials.trial import hidden_runs, simulation_of
 
 from terrain.discrepancy.runs import low_pass_of, signals_of
 from terrain.discrepancy.search import Problem, search

@@ -7,9 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from studies.blind_trials.drives import car_drives, rich_drives
-from studies.blind_trials.trial import hidden_runs
 from studies.blind_trials.limits import confusable_class, limits_of
-from studies.blind_trials.trial import simulation_of
+from studies.blind_trials.trial import hidden_runs, simulation_of
 
 import terrain.discrepancy.diagnose as diagnose_module
 from pipelines.report.results import as_json

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from studies.blind_trials.drives import rich_drives
-from studies.blind_trials.trial import hidden_runs
-from studies.blind_trials.trial import simulation_of
+from studies.blind_trials.trial import hidden_runs, simulation_of
 
 from pipelines.data.datasets import load_runs
 from terrain.discrepancy.clocks import latencies_of, shifts_of
