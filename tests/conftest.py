@@ -4,6 +4,7 @@ import csv
 import os
 import sys
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -98,54 +99,18 @@ def datasets_dir(measured):
     return borealtc.parent
 
 
-def noisy_run(run_id="SNOW_01", terrain="SNOW", seed=0, duration_s=4.0):
-    """Return a small husky run: IMU at 50 Hz, wheels at 10 Hz, all noise."""
-    rng = np.random.default_rng(seed)
-    streams = {}
-    for name, rate_hz, channels in (
-        (
-            "imu",
-            50.0,
-            [
-                f"{kind}_{axis}_{unit}"
-                for kind, unit in (("gyro", "radps"), ("accel", "mps2"))
-                for axis in "xyz"
-            ],
-        ),
-        ("wheels", 10.0, ["speed_left_mps", "speed_right_mps", "current_left_a", "current_right_a"]),
-    ):
-        n = round(duration_s * rate_hz)
-        values = rng.standard_normal((n, len(channels)))
-        values += [9.81 if channel == "accel_z_mps2" else 0.0 for channel in channels]
-        streams[name] = Stream(np.arange(n) / rate_hz, values, channels)
-    return RunLog(run_id, "husky", streams, (Label(0.0, duration_s, terrain),), source="noise")
-
-
 IMU = ("gyro_x_radps", "gyro_y_radps", "gyro_z_radps", "accel_x_mps2", "accel_y_mps2", "accel_z_mps2")
 WHEELS = ("speed_left_mps", "speed_right_mps", "current_left_a", "current_right_a")
 IMU_RATE_HZ, WHEEL_RATE_HZ = 50.0, 10.0
 
-LEVEL = {"ASPHALT": 0.7, "GRASS": 0.9, "GRAVEL": 1.2}
-"""Vibration of the terrains in m/s^2, one standard deviation."""
-SMOOTHNESS = {"ASPHALT": 0.40, "GRASS": 0.46, "GRAVEL": 0.43}
-"""How much of a vibration is left after one sample: the colour of the noise."""
-CURRENT_A = {"ASPHALT": 2.0, "GRASS": 2.1, "GRAVEL": 2.0}
-
-
-def coloured_noise(rng, n, width, smoothness):
-    """Return noise of unit variance that keeps ``smoothness`` of itself from sample to sample."""
-    white = rng.standard_normal((n, width))
-    noise = np.empty_like(white)
-    noise[0] = white[0]
-    for i in range(1, n):
-        noise[i] = smoothness * noise[i - 1] + np.sqrt(1 - smoothness**2) * white[i]
-    return noise
+TERRAINS = {"ASPHALT": (0.7, 0.40, 2.0), "GRASS": (0.9, 0.46, 2.1), "GRAVEL": (1.2, 0.43, 2.0)}
+"""Standard deviation of the vibration in m/s^2, how much of it is left after one sample, and current in A."""
 
 
 def driven_run(
-    run_id,
-    terrain,
-    seed,
+    run_id="SNOW_01",
+    terrain="SNOW",
+    seed=0,
     duration_s=24.0,
     speed_mps=0.6,
     start_s=0.0,
@@ -154,17 +119,19 @@ def driven_run(
     current_a=None,
     label=...,
 ):
-    """Return a run driven straight on at one speed over a terrain with vibrations of its own.
+    """Return a husky run driven straight on at one speed over a terrain with vibrations of its own.
 
     ``level``, ``smoothness`` and ``current_a`` replace what the terrain does; ``label`` what it is called.
     """
     rng = np.random.default_rng(seed)
-    level = LEVEL[terrain] if level is None else level
-    smoothness = SMOOTHNESS[terrain] if smoothness is None else smoothness
-    current_a = CURRENT_A[terrain] if current_a is None else current_a
+    given, usual = (level, smoothness, current_a), TERRAINS.get(terrain, (1.0, 0.0, 2.0))
+    level, smoothness, current_a = (b if a is None else a for a, b in zip(given, usual, strict=True))
     n_imu, n_wheels = round(duration_s * IMU_RATE_HZ), round(duration_s * WHEEL_RATE_HZ)
     level *= np.exp(0.08 * rng.standard_normal())  # no two runs are the same
-    shaking = level * coloured_noise(rng, n_imu, len(IMU), smoothness) * [0.1, 0.1, 0.05, 1.0, 1.0, 1.0]
+    noise = rng.standard_normal((n_imu, len(IMU)))
+    for i in range(1, n_imu):  # of unit variance at any smoothness
+        noise[i] = smoothness * noise[i - 1] + np.sqrt(1 - smoothness**2) * noise[i]
+    shaking = level * noise * [0.1, 0.1, 0.05, 1.0, 1.0, 1.0]
     imu = shaking + rng.normal(0, 0.05, len(IMU)) + [0, 0, 0, 0, 0, 9.81]
     speed = speed_mps + 0.01 * rng.standard_normal((n_wheels, 2))
     current = current_a * (1 + 0.2 * rng.standard_normal((n_wheels, 2)))
@@ -228,15 +195,16 @@ def write_borealtc(run, folder):
 
 @pytest.fixture
 def make_run():
-    return noisy_run
+    """Return the maker of a run of 4 s."""
+    return partial(driven_run, duration_s=4.0)
 
 
 @pytest.fixture
-def borealtc_dir(tmp_path):
+def borealtc_dir(tmp_path, make_run):
     """A data set of three runs in the BorealTC layout."""
     folder = tmp_path / "logs"
     for seed, run_id in enumerate(["SNOW_01", "SNOW_02", "ICE_01"]):
-        write_borealtc(noisy_run(run_id, run_id[:-3], seed), folder)
+        write_borealtc(make_run(run_id, run_id[:-3], seed), folder)
     return folder
 
 

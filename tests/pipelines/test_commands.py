@@ -46,9 +46,7 @@ REFUSED = {
         ("nowhere: does not exist; accepted are", "nowhere"),
         (LAUGHED, "data --format csv --mapping laughs.yaml"),
     ],
-    "convert data": [
-        ("cannot be written", "--out file/out"),
-    ],
+    "convert data": [("cannot be written", "--out file/out")],
     "quickstart --data data": [("cannot be written", "--out file/out")],
     "label data --run r": [
         ("there is no run 'SNOW_03'", "--run SNOW_03 --all --terrain ICE"),
@@ -73,7 +71,6 @@ REFUSED = {
     "train --data data --name m": [
         *((f"model name '{name}'", f"--name '{name}'") for name in ("", "a/b", "a:b", "a@b", "a b", "a.b")),
         ("empty: holds no run; accepted are", "--data empty"),
-        ("No such option '--protocol'", "--protocol published"),
         ("--cache is for recipe 'svm'", "--cache c --recipe cnn"),
         ("--search is for recipe 'svm'", "--search 4 --feature a:b"),
         ("--search is for recipe 'svm'", "--search 4 --recipe cnn"),
@@ -112,7 +109,6 @@ REFUSED = {
     "estimate --data data --filter": [
         ("filter 'vio15' is not for robot husky, whose drive is skid_steer: use skid", "vio15"),
         ("is there already", "skid --out data"),
-        (LAUGHED, "skid --robot laughs.yaml"),
         ("--tuning is for filters, not for --filter tracked", "tracked --tuning thesis"),
         ("--slip-model is for observers, not for --filter skid", "skid --slip-model m.yaml"),
         ("--window is for --filter pose, not for --filter vio15", "vio15 --window 0.5"),
@@ -162,7 +158,6 @@ REFUSED = {
         ("give the terrain 'bench', not 'grass'", "--scenario six_positions"),
     ],
     "drive": [
-        (LAUGHED, "--robot agrimaro --terrain grass --table laughs.yaml"),
         ("--controllers is empty; one at least is required", "--controllers ,"),
         ("--controllers is plain,plain; one at least is required, and none twice", "--controllers plain,plain"),
         ("'oracle' is unknown", "--controllers oracle"),
@@ -174,7 +169,6 @@ REFUSED = {
         ("above zero", "--controllers ramp --ramp 0"),
         ("--seeds is 0", "--seeds 0"),
         ("--delay is -0.1: ", "--delay -0.1"),
-        ("--delay is nan: ", "--delay nan"),
         ("leave the grade out", "--scenario slope --grade 5"),
         ("--grade is 40", "--grade 40"),
         ("--radius is '1,2': value should have at least 3 items", "--radius 1,2"),
@@ -217,37 +211,33 @@ REFUSED = {
         *(("--speed is", f"--replay runs --speed {text}") for text in ("0", "-1", "inf", "nan", "fast", "''")),
     ],
 }  # fmt: skip
-CASES = [(command, *case) for command, cases in REFUSED.items() for case in cases]
 
 
-@pytest.mark.parametrize(("command", "sentence", "words"), CASES)
-def test_a_mistake_is_one_sentence(refused, files, command, sentence, words):
-    refused(sentence, *shlex.split(command), *shlex.split(words))
+@pytest.mark.parametrize("command", REFUSED)
+def test_a_mistake_is_one_sentence(refused, files, command):
+    for sentence, words in REFUSED[command]:
+        refused(sentence, *shlex.split(command), *shlex.split(words))
 
 
-@pytest.mark.parametrize("words", ["--robot agrimaro --out new.yaml", "--robot rover.yaml"])
-def test_what_says_nothing_of_a_robot_calibrates_none(refused, place, files, words):
-    write_run(simulate_run(load_robot("agrimaro"), "grass", "straight", 1, duration_s=8.0), place / "logs")
-    sentence = "is one of robot 'agrimaro', and 'rover' is calibrated"
-    if "rover" not in words:
-        sentence = "nothing of robot agrimaro can be calibrated from this: no run"
-    refused(sentence, "calibrate", "--data", "logs", *words.split())
+def test_what_says_nothing_of_a_robot_calibrates_none(refused, files):
+    write_run(simulate_run(load_robot("agrimaro"), "grass", "straight", 1, duration_s=4.0), files / "logs")
+    for words, sentence in (
+        ("--robot agrimaro --out new.yaml", "nothing of robot agrimaro can be calibrated from this: no run"),
+        ("--robot rover.yaml", "is one of robot 'agrimaro', and 'rover' is calibrated"),
+    ):
+        refused(sentence, "calibrate", "--data", "logs", *words.split())
 
 
-def test_help_is_one_screen_with_every_command(terrain):
-    code, out, _ = terrain("--help")
-    assert code == 0
-    assert len(out.splitlines()) <= 40
-    assert [command.name for command in COMMANDS if f"\n  {command.name} " not in out] == []
-
-
-@pytest.mark.parametrize("name", [command.name for command in COMMANDS])
-def test_a_command_has_an_example_and_refuses_an_option_that_it_lacks(terrain, refused, name):
-    code, out, err = terrain(name, "--help")
-    assert (code, err) == (0, "")
-    assert out.startswith(f"terrain {name} ")
-    assert all(option in out for option in ("--json", "--report", "--details"))
-    refused("No such option '--nothing'", name, "--nothing", "1")
+def test_help_has_every_command_on_one_screen_and_an_example_of_each(terrain, refused):
+    _, screen, _ = terrain("--help")
+    assert len(screen.splitlines()) <= 40
+    for name in (command.name for command in COMMANDS):
+        assert f"\n  {name} " in screen
+        code, out, err = terrain(name, "--help")
+        assert (code, err) == (0, "")
+        assert out.startswith(f"terrain {name} ")
+        assert all(option in out for option in ("--json", "--report", "--details"))
+        refused("No such option '--nothing'", name, "--nothing", "1")
 
 
 def test_the_choices_of_the_command_line_are_those_that_there_are():

@@ -14,18 +14,12 @@ from terrain.errors import ConfigError, DataError
 from terrain.logs.run_folders import data_digest, read_run, write_run
 
 
-@pytest.fixture
-def held_out(in_tracked, drive_all, tmp_path):
-    """Nine runs of three terrains in a folder, and what quickstart made of them."""
-    runs = drive_all(n_runs=3, duration_s=16.0)
+def test_the_runs_that_are_predicted_took_no_part(in_tracked, drive_all, tmp_path):
+    """Nine runs of three terrains in a folder, and what quickstart makes of them."""
+    runs = drive_all(n_runs=3, duration_s=12.0)
     for each in runs:
         write_run(each, tmp_path / "data")
-    asked = Settings(data=tmp_path / "data", out=tmp_path / "out", name="held", n_jobs=1)
-    return runs, run(asked), tmp_path
-
-
-def test_the_runs_that_are_predicted_took_no_part(held_out):
-    runs, result, folder = held_out
+    result = run(Settings(data=tmp_path / "data", out=tmp_path / "out", name="held", n_jobs=1))
     assert result.held_out == ("ASPHALT_3",)
     assert {row.run_id for row in result.predict.windows} == {"ASPHALT_3"}
     assert result.predict.training_runs == ()
@@ -36,7 +30,7 @@ def test_the_runs_that_are_predicted_took_no_part(held_out):
     assert {each.run_id for each in result.crossval.per_run} == {each.run_id for each in training}
     assert [" --without ASPHALT_3" in step for step in result.commands] == [True, True, False]
     assert result.commands[-1].endswith(" --only ASPHALT_3")
-    loaded, _ = load(AlignedRunsSettings(data=folder / "data", without=("ASPHALT_3",)))
+    loaded, _ = load(AlignedRunsSettings(data=tmp_path / "data", without=("ASPHALT_3",)))
     assert data_digest(loaded) == result.data_digest
 
     page = result.report_file.read_text()

@@ -29,7 +29,9 @@ def runs_dir(tmp_path, make_run):
     """Eight runs of two terrains, in run folders."""
     for name in ("ICE", "SNOW"):
         for k in range(4):
-            write_run(make_run(f"{name}_{k}", name, k + 10 * (name == "ICE"), 7.0 + k), tmp_path / "runs")
+            write_run(
+                make_run(f"{name}_{k}", name, k + 10 * (name == "ICE"), duration_s=7.0 + k), tmp_path / "runs"
+            )
     return tmp_path / "runs"
 
 
