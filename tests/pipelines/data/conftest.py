@@ -10,4 +10,4 @@ from terrain.simulation.run import simulate_run
 @pytest.fixture(scope="session")
 def estimated_run():
     robot = load_robot("agrimaro")
-    return enriched(estimate_run(simulate_run(robot, "grass", "survey", 7, duration_s=9.0), robot, "vio15"))
+    return enriched(estimate_run(simulate_run(robot, "grass", "survey", 7, duration_s=8.5), robot, "vio15"))

@@ -71,7 +71,7 @@ def bounds(stream, column):
 
 
 @pytest.mark.parametrize("stream", STREAMS)
-@settings(max_examples=80)
+@settings(max_examples=40)
 @given(data=st.data())
 def test_any_number_comes_back_within_half_a_resolution_and_never_wraps(stream, data):
     """A value beyond is the end of the range, counted; one that is not finite is not measured."""
@@ -98,7 +98,7 @@ def test_any_number_comes_back_within_half_a_resolution_and_never_wraps(stream, 
 
 
 @pytest.mark.parametrize("stream", STREAMS)
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(data=st.data())
 def test_any_bytes_are_decoded_to_values_in_range_or_refused(stream, data):
     """Bytes of a damaged frame: no exception, no infinity, nothing beyond the bounds of the DBC."""
@@ -113,30 +113,27 @@ def test_any_bytes_are_decoded_to_values_in_range_or_refused(stream, data):
             assert math.isnan(value) or low - 1e-9 <= value <= high + 1e-9
 
 
-@pytest.mark.parametrize("stream", ["corrections", "status", "twist"])
-def test_each_wrong_bit_of_a_checked_message_is_found(stream):
-    (frame,) = encode(LAYOUT, stream, [0.1] * len(SIGNALS[stream]), 77)
-    for bit in range(64):
-        data = bytearray(frame.data)
-        data[bit // 8] ^= 1 << bit % 8
-        assert decode(LAYOUT, changed(frame, data=bytes(data))) is Drop.CHECKSUM
-    other = changed(frame, arbitration_id=0x101 if stream != "corrections" else 0x102)
-    assert decode(LAYOUT, other) is Drop.CHECKSUM, "the identifier is checked too"
+def test_each_wrong_bit_of_a_checked_message_is_found():
+    for stream in ("corrections", "status", "twist"):
+        (frame,) = encode(LAYOUT, stream, [0.1] * len(SIGNALS[stream]), 77)
+        for bit in range(64):
+            data = bytearray(frame.data)
+            data[bit // 8] ^= 1 << bit % 8
+            assert decode(LAYOUT, changed(frame, data=bytes(data))) is Drop.CHECKSUM
+        other = changed(frame, arbitration_id=0x101 if stream != "corrections" else 0x102)
+        assert decode(LAYOUT, other) is Drop.CHECKSUM, "the identifier is checked too"
 
 
-@pytest.mark.parametrize(
-    ("frame", "drop"),
-    [
+def test_a_frame_that_is_not_used_says_why():
+    for frame, drop in (
         (frame_of(0x40, is_error_frame=True), Drop.BUS_OFF),
         (frame_of(0x04, is_error_frame=True), Drop.ERROR),
         (frame_of(0x120, is_remote_frame=True), Drop.REMOTE),
         (frame_of(0x7FF, bytes(8)), Drop.UNKNOWN),
         (frame_of(0x120, bytes(8), is_extended_id=True), Drop.UNKNOWN),
         (frame_of(0x120, bytes(8), timestamp=math.nan), Drop.TIME),
-    ],
-)
-def test_a_frame_that_is_not_used_says_why(frame, drop):
-    assert decode(LAYOUT, frame) is drop
+    ):
+        assert decode(LAYOUT, frame) is drop
 
 
 def test_resolutions_are_far_below_the_noise_and_ranges_cover_the_robot():
@@ -158,11 +155,11 @@ def test_resolutions_are_far_below_the_noise_and_ranges_cover_the_robot():
     for stream, column in (("steering", 0), ("imu", 6), ("imu", 8)):
         assert bounds(stream, column)[1] > math.pi
     assert bounds("twist", 0)[1] > 1.5 * motors.speed_max_radps * ROBOT.wheel_radius_m
-    for stream, names in SIGNALS.items():
-        assert LAYOUT.columns(stream) == set(range(len(names))) - ({6} if stream == "odometry" else set())
 
 
 def test_the_signals_of_a_stream_are_in_the_order_of_its_columns():
+    for stream, names in SIGNALS.items():
+        assert LAYOUT.columns(stream) == set(range(len(names))) - ({6} if stream == "odometry" else set())
     columns = {"wheels": WHEELS_CHANNELS, "steering": STEERING_CHANNELS, "imu": IMU_CHANNELS, "twist": TWIST}
     for stream, channels in (columns | {"odometry": CAMERA_CHANNELS}).items():
         assert tuple(SIGNALS[stream]) == channels
@@ -202,18 +199,15 @@ def test_a_sample_has_the_stamp_of_its_first_frame_whatever_their_order():
     np.testing.assert_allclose(found["wheels"].values, [4 + np.arange(6) * 0.1], atol=1e-2)
 
 
-@pytest.mark.parametrize("lost", [0, 1, 2])
-def test_a_lost_frame_is_nan_in_its_part_only(lost):
-    sent = [f for k in range(3) for j, f in enumerate(frames(k, 1.0 + 0.01 * k)) if (k, j) != (1, lost)]
-    receiver, found = received(sent)
-    gone = np.isnan(found["imu"].values)
-    assert gone.sum() == 3
-    assert gone[1, 3 * lost : 3 * lost + 3].all()
-    assert receiver.dropped == {"imu: part missing": 1}
-    assert (np.diff(found["imu"].time_s) > 0).all()
-
-
-def test_an_incomplete_sample_waits_and_is_used_in_the_end():
+def test_a_lost_frame_is_nan_in_its_part_only_and_an_incomplete_sample_waits():
+    for lost in (0, 1, 2):
+        sent = [f for k in range(3) for j, f in enumerate(frames(k, 1.0 + 0.01 * k)) if (k, j) != (1, lost)]
+        receiver, found = received(sent)
+        gone = np.isnan(found["imu"].values)
+        assert gone.sum() == 3
+        assert gone[1, 3 * lost : 3 * lost + 3].all()
+        assert receiver.dropped == {"imu: part missing": 1}
+        assert (np.diff(found["imu"].time_s) > 0).all()
     receiver = Receiver(LAYOUT, ("imu",))
     receiver.take(frames(0, 1.0)[0])
     assert receiver.readings(1.0 + 0.5 * INCOMPLETE_S) == {}
@@ -239,9 +233,8 @@ def test_what_is_no_new_sample_is_dropped_and_counted():
 MOTORS = 'SG_ MotorRate1 : 0|18@1- (0.002,0) [-262.142|262.142] "rad/s"'
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "sentence"),
-    [
+def test_a_dbc_that_does_not_fit_is_one_sentence(tmp_path, monkeypatch):
+    for old, new, sentence in (
         (" SG_ MotorRate1 ", " SG_ Speed1 ", "lacks the signal 'MotorRate1'"),
         (MOTORS, MOTORS.replace('"rad/s"', '"m/s"'), "of motor_1_radps: unit 'm/s' does not suit it"),
         (MOTORS, MOTORS.replace('"rad/s"', '""'), "of motor_1_radps: unit '' is unknown"),
@@ -259,17 +252,12 @@ MOTORS = 'SG_ MotorRate1 : 0|18@1- (0.002,0) [-262.142|262.142] "rad/s"'
         (TEXT, "VERSION", "robot.dbc"),
         (TEXT, "\x00\x01" * 99, "robot.dbc"),
         (TEXT, TEXT[: len(TEXT) // 3], "robot.dbc"),
-    ],
-)
-def test_a_dbc_that_does_not_fit_is_one_sentence(tmp_path, old, new, sentence):
-    assert old in TEXT
-    (tmp_path / "robot.dbc").write_text(TEXT.replace(old, new))
-    with pytest.raises(ConfigError, match=re.escape(sentence)) as raised:
-        load_layout(tmp_path / "robot.dbc")
-    assert "\n" not in str(raised.value)
-
-
-def test_no_dbc_and_no_package_are_one_sentence(tmp_path, monkeypatch):
+    ):
+        assert old in TEXT
+        (tmp_path / "robot.dbc").write_text(TEXT.replace(old, new))
+        with pytest.raises(ConfigError, match=re.escape(sentence)) as raised:
+            load_layout(tmp_path / "robot.dbc")
+        assert "\n" not in str(raised.value)
     with pytest.raises(ConfigError, match="cannot be opened"):
         load_layout(tmp_path / "none.dbc")
     monkeypatch.setitem(sys.modules, "cantools", None)

@@ -34,11 +34,11 @@ KNOWN = {
 def whole(tmp_path_factory):
     """Return the bytes of a whole file of each kind, and a folder to work in."""
     folder = tmp_path_factory.mktemp("whole")
-    rows = husky_rows(40)
+    rows = husky_rows(30)
     files = {
-        "zstd": write_mcap(folder / "zstd.mcap", rows, chunk_size=5000),
-        "lz4": write_mcap(folder / "lz4.mcap", rows, CompressionType.LZ4, chunk_size=5000),
-        "none": write_mcap(folder / "none.mcap", rows, CompressionType.NONE, chunk_size=5000),
+        "zstd": write_mcap(folder / "zstd.mcap", rows, chunk_size=4000),
+        "lz4": write_mcap(folder / "lz4.mcap", rows, CompressionType.LZ4, chunk_size=4000),
+        "none": write_mcap(folder / "none.mcap", rows, CompressionType.NONE, chunk_size=4000),
         "loose": write_mcap(folder / "loose.mcap", rows, use_chunking=False),
         "sqlite": write_bag(folder / "sqlite", rows) / "sqlite.db3",
         "ros1": write_ros1(folder / "ros1.bag", rows),
@@ -68,7 +68,7 @@ def read(folder, kind, content, repair):
     st.lists(st.tuples(st.floats(0.0, 1.0), st.integers(0, 255)), max_size=8),
     st.booleans(),
 )
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=100)
 def test_a_file_that_is_cut_off_or_changed_is_refused_or_counted_or_has_other_numbers(
     whole, kind, part, changes, repair
 ):
@@ -94,7 +94,7 @@ def test_a_chunk_that_is_changed_is_refused_and_left_out_when_repairing(whole):
     assert read(folder, "none", bytes(content), repair=False) is None
     run = read(folder, "none", bytes(content), repair=True)
     assert run.dropped["damaged blocks of messages"] == 1
-    assert 20 < len(run.streams["imu"]) < 40
+    assert 12 < len(run.streams["imu"]) < 30
 
 
 def record(op, content):
@@ -107,17 +107,15 @@ def chunk(size, compression, packed, crc=0):
     return record(6, head + struct.pack("<Q", len(packed)) + packed)
 
 
-@pytest.mark.parametrize("compression", ["zstd", "lz4"])
-@pytest.mark.parametrize("stated", [100, 200_000_000, 2**40])
-def test_a_chunk_that_grows_beyond_bounds_is_refused_without_being_unpacked(tmp_path, compression, stated):
-    zeros = bytes(100_000_000)
-    packed = zstandard.compress(zeros) if compression == "zstd" else lz4.frame.compress(zeros)
-    content = MCAP_MAGIC + chunk(stated, compression, packed)
-    del zeros
+@pytest.mark.parametrize("pack", [zstandard.compress, lz4.frame.compress])
+def test_a_chunk_that_grows_beyond_bounds_is_refused_without_being_unpacked(tmp_path, pack):
+    packed = pack(bytes(100_000_000))
+    compression = "zstd" if pack is zstandard.compress else "lz4"
     tracemalloc.start()
     try:
-        for repair in (False, True):
-            assert read(tmp_path, "zstd", content, repair) is None
+        for stated in (100, 200_000_000, 2**40):
+            content = MCAP_MAGIC + chunk(stated, compression, packed)
+            assert [read(tmp_path, "zstd", content, repair) for repair in (False, True)] == [None, None]
         assert tracemalloc.get_traced_memory()[1] < 60_000_000
     finally:
         tracemalloc.stop()
@@ -130,9 +128,8 @@ def test_a_bag_of_ros_1_does_not_unpack_to_more_than_is_accepted(whole, monkeypa
     refused("would have more than 1000 bytes", folder / "bound.bag", mapping="husky_topics")
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
+def test_records_and_chunks_that_are_nonsense_are_one_sentence(tmp_path):
+    for content in (
         b"",
         record(6, b""),
         chunk(5, "", b"\x05\xff\xff\xff\xff"),
@@ -141,11 +138,9 @@ def test_a_bag_of_ros_1_does_not_unpack_to_more_than_is_accepted(whole, monkeypa
         record(3, b"\x01\x00\xff\xff\xff\xff"),
         record(5, bytes(22)) + record(15, bytes(4)),
         MCAP_MAGIC,
-    ],
-)
-def test_records_and_chunks_that_are_nonsense_are_one_sentence(tmp_path, content):
-    for repair in (False, True):
-        assert read(tmp_path, "zstd", MCAP_MAGIC + content, repair) is None
+    ):
+        for repair in (False, True):
+            assert read(tmp_path, "zstd", MCAP_MAGIC + content, repair) is None
 
 
 def test_a_view_in_the_place_of_a_table_is_refused(tmp_path):

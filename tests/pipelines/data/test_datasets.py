@@ -17,10 +17,10 @@ def test_the_measured_data_sets_are_read_whole(datasets_dir):
     }  # fmt: skip
     assert [run.run_id for run in borealtc] == sorted(run.run_id for run in borealtc)
     assert sum(len(run.streams["imu"]) for run in borealtc) == pytest.approx(340_000, rel=0.1)
-    for run in (
+    for run in [
         *borealtc,
         *vulpi,
-    ):  # columns are taken by name: gravity is on z, wheels turn at walking speed
+    ]:  # columns are taken by name: gravity is on z, wheels turn at walking speed
         assert 8.0 < np.mean(run.streams["imu"].channel("accel_z_mps2")) < 11.0
         assert np.max(np.abs(run.streams["wheels"].channel("speed_left_mps"))) < 1.6
 

@@ -21,6 +21,10 @@ from terrain.simulation.run import simulate_run
 TARGETS = ("mcap", "ros2", "ros2-mcap")
 
 
+def exported(source, out, target="mcap", **options):
+    return convert(Settings(data=source, out=out, to=target, **options))
+
+
 @pytest.fixture(scope="module")
 def raw(tmp_path_factory, estimated_run):
     """Return a folder with a simulated run of each robot, one of them with its estimates."""
@@ -30,17 +34,18 @@ def raw(tmp_path_factory, estimated_run):
     return folder
 
 
-def exported(source, out, target="mcap", **options):
-    return convert(Settings(data=source, out=out, to=target, **options))
+@pytest.fixture(scope="module")
+def vulpi(tmp_path_factory, datasets_dir):
+    """Return a folder with a run of a measured data set."""
+    folder = tmp_path_factory.mktemp("vulpi")
+    write_run(load_runs(datasets_dir / "vulpi")[0], folder)
+    return folder
 
 
 @pytest.mark.parametrize("target", [*TARGETS, "csv"])
-def test_an_export_is_imported_as_the_same_runs(raw, datasets_dir, tmp_path, target):
+def test_an_export_is_imported_as_the_same_runs(raw, vulpi, tmp_path, target):
     """Simulated and measured runs, one with its estimates; a CSV file has no more than streams."""
-    measured = tmp_path / "measured"
-    for run in load_runs(datasets_dir / "vulpi")[:1]:
-        write_run(run, measured)
-    for source in (measured,) if target == "csv" else (raw, measured):
+    for source in (vulpi,) if target == "csv" else (raw, vulpi):
         out = tmp_path / "out" / source.name
         before, result = load_runs(source), exported(source, out, target)
         read = {"mapping": out / "mapping.yaml"} if target == "csv" else {"layout": "bag"}
@@ -112,9 +117,10 @@ def check(run, messages):
     assert json.loads(messages["/terrain/run"][0].data)["run_id"] == run.run_id
 
 
-def test_standard_messages_of_an_export_are_a_run_by_a_mapping_too(raw, estimated_run, tmp_path):
+def test_standard_messages_of_an_export_are_a_run_by_a_mapping_too(estimated_run, tmp_path):
     run = estimated_run
-    exported(raw, tmp_path)
+    write_run(run, tmp_path / "runs")
+    exported(tmp_path / "runs", tmp_path)
     (tmp_path / "own.yaml").write_text(
         "robot: agrimaro\nstreams:\n  imu: {topic: /imu, kind: imu}\n"
         "  odometry: {topic: /odometry, kind: odometry}\n"
@@ -128,35 +134,35 @@ def test_standard_messages_of_an_export_are_a_run_by_a_mapping_too(raw, estimate
             np.testing.assert_allclose(again.streams[name].channel(channel), sent, atol=tolerance)
 
 
-@pytest.mark.parametrize("target", TARGETS)
-def test_recorded_windows_go_with_their_run_out_and_in(raw, tmp_path, target):
-    run = load_runs(raw)[0]
-    given = {
+def test_recorded_windows_go_with_their_run_out_and_in(make_run, tmp_path):
+    of_window = {
         "start_s": 1.0,
         "end_s": 3.0,
         "terrain": "ICE",
         "probabilities": {"ICE": 0.75},
         "doubtful": False,
     }
-    figures = ((0.75, ""), (None, "not finite"))
-    windows = [RecordedWindow(**given, probability=p, refused=why) for p, why in figures]
-    place = write_run(run, tmp_path / "raw", beside={WINDOWS_FILE: windows_text(windows)})
-    result = exported(tmp_path / "raw", tmp_path / "out", target)
-    assert result.topics["/terrain/window"] == 2
-    convert(Settings(data=tmp_path / "out", out=tmp_path / "again"))
-    assert (tmp_path / "again" / run.run_id / WINDOWS_FILE).read_text() == (place / WINDOWS_FILE).read_text()
+    windows = [RecordedWindow(**of_window, probability=0.75, refused="")]
+    windows += [RecordedWindow(**of_window, probability=None, refused="not finite")]
+    place = write_run(make_run("a"), tmp_path / "raw", beside={WINDOWS_FILE: windows_text(windows)})
+    for target in TARGETS:
+        assert exported(tmp_path / "raw", tmp_path / target, target).topics["/terrain/window"] == 2
+        exported(tmp_path / target, tmp_path / f"{target}_again", "runs")
+        again = tmp_path / f"{target}_again" / "a" / WINDOWS_FILE
+        assert again.read_text() == (place / WINDOWS_FILE).read_text()
     for damage in ('{"version": 1}', '{"windows": [3]}', '{"version": 1, "windows": [{"end_s": "x"}]}'):
         (place / WINDOWS_FILE).write_text(damage)
         with pytest.raises(LogError, match="is damaged"):
-            exported(tmp_path / "raw", tmp_path / "other", target)
+            exported(tmp_path / "raw", tmp_path / "other")
 
 
 @pytest.mark.parametrize("package", ["mcap", "rosbags", "zstandard"])
-def test_a_missing_package_is_named_in_one_sentence(raw, tmp_path, monkeypatch, package):
-    exported(raw, tmp_path / "mcap")
+def test_a_missing_package_is_named_in_one_sentence(make_run, tmp_path, monkeypatch, package):
+    write_run(make_run("a"), tmp_path / "raw")
+    exported(tmp_path / "raw", tmp_path / "mcap")
     for name in [name for name in sys.modules if name.split(".")[0] == package]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ConfigError, match=r"pip install 'terrain-slip\[logs\]'"):
-        exported(tmp_path / "mcap" if package == "zstandard" else raw, tmp_path / "out")
+        exported(tmp_path / ("mcap" if package == "zstandard" else "raw"), tmp_path / "out")
     assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
