@@ -33,13 +33,13 @@ each expected by the other runs alone.
 
 from __future__ import annotations
 
-import warnings
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize, minimize_scalar
 from scipy.special import softmax
 
 from terrain.classify.grouped import GroupedClassifier
@@ -56,8 +56,8 @@ MIN_SPREAD = 1e-9
 SAME_REGIME, CELL = 0.1, 0.25
 #: Of a process: its cost grows with their cube. Where there are more, units are thinned evenly.
 MAX_POINTS = 1200
-#: Distance of two wheels as the kernel sees it: far for a wheel's own part, nothing for the shared one.
-APART, FAR = 10.0, 1e6
+#: Where the search for a, b and c begins, in variances of the responses, and the bounds of each.
+START, BOUNDS = (1.0, 0.1, 0.05), ((1e-4, 1e3), (1e-4, 1e3), (1e-4, 10.0))
 #: Of a standard deviation, as a share of the response's spread over the ground: a response that repeats exactly (a
 #: counter that never moves) would outweigh all others.
 FLOOR = 1e-3
@@ -104,12 +104,17 @@ class Process(NamedTuple):
 
     def predict(self, regime: Array, wheel: int) -> Array:
         """Return the expected response (n,) of a wheel at regimes (n, c)."""
-        scale = np.full(regime.shape[1], self.length)
-        scale[-1] = SPEED_LENGTH
-        a, b = regime / scale, self.regime / scale
-        squared = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2.0 * a @ b.T
         shared = self.common + self.own * (self.wheel == wheel)
-        return np.asarray(self.mean + np.exp(-0.5 * np.maximum(squared, 0.0)) @ (shared * self.weight))
+        return np.asarray(self.mean + _alike(regime, self.regime, self.length) @ (shared * self.weight))
+
+
+def _alike(one: Array, other: Array, length: float) -> Array:
+    """Return e (n, m) of regimes (n, c) and (m, c)."""
+    scale = np.full(one.shape[1], length)
+    scale[-1] = SPEED_LENGTH
+    a, b = one / scale, other / scale
+    squared = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2.0 * a @ b.T
+    return np.asarray(np.exp(-0.5 * np.maximum(squared, 0.0)))
 
 
 def fit_process(regime: Array, wheel: Array, response: Array, block: Array) -> tuple[Process, Array]:
@@ -117,38 +122,36 @@ def fit_process(regime: Array, wheel: Array, response: Array, block: Array) -> t
 
     That is, of each response, what it differs by from the process without its own block (m,), its run.
     """
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-
     mean, spread = float(response.mean()), float(response.std())
     if len(response) < 3 or spread < MIN_SPREAD:
         return Process(mean, regime, wheel, np.zeros(len(response)), 0.0, 0.0, 1.0), response - mean
-    n_wheels = len(np.unique(wheel))
-    apart = APART * np.eye(max(int(wheel.max()) + 1, 1))[wheel]
-    points = np.column_stack([regime, apart])
-    scaled = (response - mean) / spread
+    scaled, none = (response - mean) / spread, np.eye(len(response))
+    first = 0 if len(np.unique(wheel)) > 1 else 1  # one wheel shares nothing
+    best, likeliest = None, math.inf
+    for length in LENGTHS:
+        alike = _alike(regime, regime, length)
+        parts = np.array([alike, alike * (wheel[:, None] == wheel), none][first:])
 
-    def fitted(length: float) -> Any:
-        scales = [length] * (regime.shape[1] - 1) + [SPEED_LENGTH]
-        shared = ConstantKernel(1.0, (1e-4, 1e3)) * RBF([*scales, *[FAR] * apart.shape[1]], "fixed")
-        own = ConstantKernel(0.1, (1e-4, 1e3)) * RBF([*scales, *[1.0] * apart.shape[1]], "fixed")
-        kernel = (shared + own if n_wheels > 1 else own) + WhiteKernel(0.05, (1e-4, 10.0))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)
-            return GaussianProcessRegressor(kernel, alpha=1e-8).fit(points, scaled)
+        def unlikely(logs: Array, parts: Array = parts) -> tuple[float, Array]:
+            """Return the negative log likelihood of a, b and c by their logarithms, and its gradient."""
+            scaled_parts = np.exp(logs)[:, None, None] * parts
+            factor = cho_factor(scaled_parts.sum(axis=0) + 1e-8 * none, lower=True)
+            weight = cho_solve(factor, scaled)
+            value = 0.5 * scaled @ weight + np.log(np.diag(factor[0])).sum()
+            apart = cho_solve(factor, none) - np.outer(weight, weight)
+            return float(value), 0.5 * np.einsum("pij,ij->p", scaled_parts, apart)
 
-    by_length = {length: fitted(length) for length in LENGTHS}
-    length = max(LENGTHS, key=lambda each: by_length[each].log_marginal_likelihood_value_)
-    best = by_length[length]
-    numbers = best.kernel_.get_params()
-    common = float(numbers["k1__k1__k1__constant_value"]) if n_wheels > 1 else 0.0
-    own = float(numbers["k1__k2__k1__constant_value" if n_wheels > 1 else "k1__k1__constant_value"])
-    covariance = best.kernel_(points) + 1e-8 * np.eye(len(points))
+        logs, bounds = np.log(START[first:]), np.log(BOUNDS[first:])
+        found = minimize(unlikely, logs, method="L-BFGS-B", jac=True, bounds=bounds)
+        if best is None or found.fun < likeliest:
+            best, likeliest = (length, np.exp(found.x), parts), found.fun
+    assert best is not None
+    length, numbers, parts = best
+    covariance = np.einsum("p,pij->ij", numbers, parts) + 1e-8 * none
     weight = cho_solve(cho_factor(covariance), scaled) * spread
-    return Process(mean, regime, wheel, weight, common, own, length), left_out(
-        covariance, scaled, block
-    ) * spread
+    common = 0.0 if first else float(numbers[0])
+    process = Process(mean, regime, wheel, weight, common, float(numbers[-2]), length)
+    return process, left_out(covariance, scaled, block) * spread
 
 
 def left_out(covariance: Array, response: Array, block: Array) -> Array:
@@ -265,8 +268,15 @@ class GroupedResponse(GroupedClassifier):
 
     columns: Any = ()  #: :class:`ResponseColumns` of the matrix, or () until they are known
 
-    def fit(self, X: Array, y: Array, groups: Array | None = None) -> GroupedResponse:
+    def fit(
+        self, X: Array, y: Array, groups: Array | None = None, body: Array | None = None
+    ) -> GroupedResponse:
         """Fit the responses of each terrain to wheel speeds in m/s and responses, NaN where missing.
+
+        Parameters
+        ----------
+        X, y, groups : (n, columns) speeds and responses, and terrain and run (n,) of each row
+        body : (n, b) what grounds expect of the whole robot beside the responses; it names no terrain
 
         Raises
         ------
@@ -277,10 +287,11 @@ class GroupedResponse(GroupedClassifier):
         X, y, groups = self._training_rows(X, y, groups)
         if not self.columns or sum(self.columns) != X.shape[1]:
             raise DataError(f"the columns of wheels and responses do not describe rows of {X.shape[1]}")
-        responses = X[:, self.columns[0] :]
+        responses, n = X[:, self.columns[0] :], self.columns[1]
+        both = responses if body is None else np.column_stack([responses, body])
         self.fastest_mps_ = float(np.nanmax(np.linalg.norm(X[:, : self.columns[0]], axis=1), initial=0.0))
         regime, moving = self._regimes(X)
-        usable = moving & np.isfinite(X).all(axis=1)
+        usable = moving & np.isfinite(X).all(axis=1) & np.isfinite(both).all(axis=1)
         grounds, expected = [], np.full(responses.shape, np.nan)
         for name in self.classes_:
             rows = np.flatnonzero(usable & (y == name))
@@ -288,14 +299,15 @@ class GroupedResponse(GroupedClassifier):
                 raise DataError(
                     f"no window of class {str(name)!r} has a robot that moves and all of its responses"
                 )
-            ground, expected[rows] = fit_ground(regime[rows], responses[rows], groups[rows])
+            ground, awaited = fit_ground(regime[rows], both[rows], groups[rows], both.shape[1] - n)
+            expected[rows] = awaited[:, :n]
             grounds.append(ground)
         self.grounds_ = tuple(grounds)
         likely = np.full((len(X), len(self.classes_)), np.nan)
         likely[usable] = self._log_likelihood(regime[usable], responses[usable])
         for j, name in enumerate(self.classes_):
             own = usable & (y == name)
-            likely[own, j] = log_density(responses[own] - expected[own], grounds[j].covariance)
+            likely[own, j] = log_density(responses[own] - expected[own], grounds[j].covariance[:n, :n])
         rows = np.flatnonzero(usable)
         truth = np.searchsorted(self.classes_, y[rows])
 
@@ -325,8 +337,9 @@ class GroupedResponse(GroupedClassifier):
         return regimes(speed, self.fastest_mps_), moving
 
     def _log_likelihood(self, regime: Array, responses: Array) -> Array:
+        n = responses.shape[1]
         return np.column_stack(
-            [log_density(responses - g.expected(regime), g.covariance) for g in self.grounds_]
+            [log_density(responses - g.expected(regime)[:, :n], g.covariance[:n, :n]) for g in self.grounds_]
         )
 
 

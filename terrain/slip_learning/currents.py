@@ -86,17 +86,14 @@ class SlipRegressor(RegressorMixin, BaseEstimator):
         if not usable.any():
             raise DataError("no window has a measured slip beside all its wheel speeds and responses")
         X, y, terrain, groups = X[usable], y[usable], terrain[usable], groups[usable]
-        self.terrains_ = np.unique(terrain)
-        self.classifier_ = None
-        if len(self.terrains_) > 1:
-            self.classifier_ = GroupedResponse(self.columns).fit(X, terrain, groups=groups)
+        self.terrains_, self.classifier_ = np.unique(terrain), None
         self.fastest_mps_ = float(np.linalg.norm(X[:, :n_wheels], axis=1).max())
-        regime = regimes(X[:, :n_wheels], self.fastest_mps_)
-        both = np.column_stack([X[:, n_wheels:], y])
-        self.grounds_ = tuple(
-            fit_ground(regime[rows], both[rows], groups[rows], n_body=1)[0]
-            for rows in (np.flatnonzero(terrain == name) for name in self.terrains_)
-        )
+        if len(self.terrains_) > 1:
+            self.classifier_ = GroupedResponse(self.columns).fit(X, terrain, groups, y[:, None])
+            self.grounds_ = self.classifier_.grounds_
+        else:
+            regime, both = regimes(X[:, :n_wheels], self.fastest_mps_), np.column_stack([X[:, n_wheels:], y])
+            self.grounds_ = (fit_ground(regime, both, groups, n_body=1)[0],)
         return self
 
     def predict(self, X: Array) -> Array:

@@ -50,9 +50,9 @@ def omni_run(rng, run_id, terrain, direction, slip, current_a, session="", noise
 def one_ground():
     rng = np.random.default_rng(0)
     return [
-        omni_run(rng, f"{name}_{i:02d}", name, i * 0.3, SLIP[name], CURRENT[name], noise=(0.05, 0.5))
+        omni_run(rng, f"{name}_{i:02d}", name, i * 0.6, SLIP[name], CURRENT[name], noise=(0.05, 0.5))
         for name in SLIP
-        for i in range(20)
+        for i in range(10)
     ]
 
 
@@ -111,7 +111,7 @@ def test_what_cannot_be_measured_is_refused_in_one_sentence(one_ground):
 
 
 def test_the_command_writes_result_runs_and_pictures(terrain, place, one_ground):
-    for run in one_ground[::4]:
+    for run in one_ground[::2]:
         write_run(run, place / "one")
     words = ("estimate", "--filter", "pose", "--data", "one", "--out", "out", "--figures", "figures")
     code, out, err = terrain(*words, "--json", "slip.json")
