@@ -99,7 +99,7 @@ def test_the_interval_of_coloured_noise_is_wider(nominal):
     rng, imu = np.random.default_rng(1), {}
     for smoothness in (0.0, 0.6):
         found = [
-            noise_of([noise_run(nominal, rng, smoothness)], nominal)["sensors.yaw_std_rad"] for _ in range(20)
+            noise_of([noise_run(nominal, rng, smoothness)], nominal)["sensors.yaw_std_rad"] for _ in range(12)
         ]
         imu[smoothness] = np.mean([(f.low <= 0.002 <= f.high, f.high - f.low) for f in found], axis=0)
     assert min(imu[0.0][0], imu[0.6][0]) >= 0.8

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from pipelines.data.datasets import load_runs
 from terrain.errors import DataError
 from terrain.logs import clock
 from terrain.logs.clock import MAX_OFFSET_S, align, estimate_clock
@@ -58,16 +57,13 @@ def test_a_hidden_clock_comes_back_within_its_own_error():
     assert 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.5
 
 
-def test_a_clock_that_counts_from_long_ago_gives_the_same_answer():
-    near = estimate_clock(hidden_clock(3, 0.3, -0.01), track_m=TRACK_M)
-    far = estimate_clock(hidden_clock(3, 0.3, -0.01, origin_s=1.7e9), track_m=TRACK_M)
-    assert far.reference_s == 1.7e9
-    np.testing.assert_allclose(far.offset_s, near.offset_s, atol=0.1 * near.offset_std_s)
-
-
 def test_aligned_wheels_keep_the_clock_of_the_imu():
-    run = hidden_clock(1, 0.5, -0.015)
-    aligned = align(run, estimate_clock(run, track_m=TRACK_M))
+    """A clock that counts from long ago gives the same answer."""
+    run, late = hidden_clock(1, 0.5, -0.015), hidden_clock(1, 0.5, -0.015, origin_s=1.7e9)
+    found, far = (estimate_clock(each, track_m=TRACK_M) for each in (run, late))
+    assert far.reference_s == 1.7e9
+    np.testing.assert_allclose(far.offset_s, found.offset_s, atol=0.1 * found.offset_std_s)
+    aligned = align(run, found)
     np.testing.assert_allclose(aligned.streams["wheels"].time_s, 0.985 * WHEEL_TIME_S + 0.5, atol=0.05)
     again = estimate_clock(aligned, track_m=TRACK_M)
     assert abs(again.offset_s) < 0.01
@@ -92,7 +88,7 @@ def both(one, other):
     return RunLog("A", "husky", {"imu": one.streams["imu"], "wheels": other.streams["wheels"]})
 
 
-def test_what_does_not_match_is_not_matched(monkeypatch):
+def test_what_does_not_match_is_not_matched_and_without_a_gyro_refused(monkeypatch):
     """Sides exchanged, an offset beyond the search, other turns, or hardly any."""
     run, rng = hidden_clock(2, 0.2, 0.0), np.random.default_rng(6)
     wheels = run.streams["wheels"]
@@ -113,6 +109,8 @@ def test_what_does_not_match_is_not_matched(monkeypatch):
         found = estimate_clock(each, track_m=TRACK_M)
         assert found.status == "not excited"
         assert np.isnan([found.offset_s, found.rate, found.gain]).all()
+    with pytest.raises(DataError, match="SNOW_01: clocks cannot be compared without imu"):
+        estimate_clock(replace(run, streams={"wheels": wheels}), track_m=TRACK_M)
 
 
 def test_one_turn_determines_the_clock_offset_but_not_its_rate():
@@ -142,15 +140,9 @@ def test_gaps_and_missing_samples_are_endured():
     assert abs(found.rate - 0.01) < 3 * found.rate_std
 
 
-def test_a_run_without_a_gyro_cannot_be_compared():
-    run = hidden_clock(0, 0.0, 0.0)
-    with pytest.raises(DataError, match="SNOW_01: clocks cannot be compared without imu"):
-        estimate_clock(RunLog("SNOW_01", "husky", {"wheels": run.streams["wheels"]}), track_m=TRACK_M)
-
-
-def test_measured_runs_give_plausible_clocks(datasets_dir):
+def test_measured_runs_give_plausible_clocks(measured_runs):
     """Where the turns tell, the gain is that of a skid-steer robot; steady driving is left alone."""
-    runs = {run.run_id: run for run in load_runs(datasets_dir / "borealtc")}
+    runs = {run.run_id: run for run in measured_runs("borealtc")}
     for run_id in ("ASPHALT_04", "FLOORING_02", "ICE_02"):
         found = estimate_clock(runs[run_id], track_m=TRACK_M)
         ends = runs[run_id].streams["imu"].time_s[-1] / runs[run_id].streams["wheels"].time_s[-1] - 1

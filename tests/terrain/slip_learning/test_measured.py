@@ -67,7 +67,7 @@ def test_a_hidden_slip_of_an_omni_robot_comes_back(make_omni_run, robotino, slip
 
 def test_the_stated_std_of_a_slip_covers_its_error(make_omni_run, robotino):
     inside, errors = [], []
-    for seed in range(12):
+    for seed in range(8):
         run = make_omni_run(np.random.default_rng(seed), slip=0.3, noise_m=0.002)
         found = measured_slip(run, robotino)
         errors.append((found.body_slip - 0.3)[found.steady])
@@ -122,23 +122,18 @@ def test_a_standing_robot_has_no_slip(make_omni_run, robotino):
 def test_a_wheel_that_spins_is_named(make_omni_run, robotino):
     run = make_omni_run(twist=(0.1, 0.0, 0.0), slip=0.1)
     wheels = run.streams["wheels"]
-    values = wheels.values.copy()
-    column = wheels.channels.index("speed_2_mps")
-    values[:, column] = 0.4
-    lifted = replace(run, streams={**run.streams, "wheels": Stream(wheels.time_s, values, wheels.channels)})
-    assert list(spinning_wheels(measured_slip(lifted, robotino))) == ["2"]
-    assert list(spinning_wheels(measured_slip(run, robotino))) == []
+    values = np.where(np.array(wheels.channels) == "speed_2_mps", 0.4, wheels.values)
+    lifted = replace(run, streams={**run.streams, "wheels": replace(wheels, values=values)})
+    for each, names in ((run, []), (lifted, ["2"])):
+        assert list(spinning_wheels(measured_slip(each, robotino))) == names
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.15, 0.4])
+@pytest.mark.parametrize("delay_s", [0.0, 0.4])
 def test_a_hidden_delay_is_found_within_its_interval(make_omni_run, robotino, delay_s):
-    rng = np.random.default_rng(1)
-    runs = [
-        make_omni_run(
-            rng, start_s=0.5 + 0.2 * i, delay_s=delay_s, slip=0.1 + 0.02 * i, twist=(0.2, 0.1 * i, 0.0)
-        )
-        for i in range(6)
-    ]
+    rng, runs = np.random.default_rng(1), []
+    for i in range(6):
+        drive = {"start_s": 0.5 + 0.2 * i, "slip": 0.1 + 0.02 * i, "twist": (0.2, 0.1 * i, 0.0)}
+        runs.append(make_omni_run(rng, delay_s=delay_s, **drive))
     found = estimate_delay(runs, robotino)
     assert found.status is DelayStatus.ESTIMATED
     assert abs(found.delay_s - delay_s) < max(3 * found.std_s, 0.02)

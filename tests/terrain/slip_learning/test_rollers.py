@@ -81,18 +81,21 @@ def test_too_few_runs_are_refused(make_omni_run, robotino):
         roller_findings(runs, ["cork"] * 4, robotino, [])
 
 
-@pytest.mark.parametrize("distance_m", [0.115, 0.125, 0.135])
+def turning(make_omni_run, robot, rng, n, seen_yaw):
+    """Return measured runs ahead with small turns of the wheels, as ``seen_yaw(pose)`` has the headings."""
+    runs = []
+    for _ in range(n):
+        run = make_omni_run(rng, twist=(0.1, 0.0, rng.normal(0.0, 0.05)), slip=0.0, start_s=-1.0)
+        pose = run.streams["pose"]
+        seen = replace(pose, values=np.column_stack([pose.values[:, :2], seen_yaw(pose)]))
+        runs.append(measured_slip(replace(run, streams={**run.streams, "pose": seen}), robot))
+    return runs
+
+
+@pytest.mark.parametrize("distance_m", [0.115, 0.135])
 def test_a_hidden_distance_of_the_wheels_comes_back_by_small_turns(make_omni_run, robotino, distance_m):
     rng = np.random.default_rng(3)
-    runs = []
-    for _ in range(20):
-        turn = rng.normal(0.0, 0.05)
-        run = make_omni_run(rng, twist=(0.1, 0.0, turn), slip=0.0, start_s=-1.0)
-        pose = run.streams["pose"]
-        values = pose.values.copy()
-        values[:, 2] *= 0.125 / distance_m
-        seen = replace(pose, values=values)
-        runs.append(measured_slip(replace(run, streams={**run.streams, "pose": seen}), robotino))
+    runs = turning(make_omni_run, robotino, rng, 20, lambda pose: pose.values[:, 2] * 0.125 / distance_m)
     found = distance_bound(runs, robotino, rng)
     assert found.interval_m[0] - 0.001 < distance_m < found.interval_m[1] + 0.001
     assert found.correlation > 0.95
@@ -100,12 +103,6 @@ def test_a_hidden_distance_of_the_wheels_comes_back_by_small_turns(make_omni_run
 
 def test_turns_that_do_not_follow_the_wheels_say_nothing_of_their_distance(make_omni_run, robotino):
     rng = np.random.default_rng(4)
-    runs = []
-    for _ in range(8):
-        run = make_omni_run(rng, twist=(0.1, 0.0, rng.normal(0.0, 0.05)), slip=0.0, start_s=-1.0)
-        values = run.streams["pose"].values.copy()
-        values[:, 2] = 0.4 + rng.normal(0.0, 0.05) * run.streams["pose"].time_s
-        seen = replace(run.streams["pose"], values=values)
-        runs.append(measured_slip(replace(run, streams={**run.streams, "pose": seen}), robotino))
+    runs = turning(make_omni_run, robotino, rng, 8, lambda pose: 0.4 + rng.normal(0.0, 0.05) * pose.time_s)
     assert distance_bound(runs, robotino, rng) is None
     assert distance_bound(runs[:2], robotino, rng) is None
