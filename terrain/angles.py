@@ -46,3 +46,31 @@ def unwrapped(angle_rad: Array) -> Array:
     known = np.isfinite(out)
     out[known] = np.unwrap(out[known])
     return out
+
+
+def arcs(position_m: Array, yaw_rad: Array, frame_yaw_rad: float = 0.0) -> Array:
+    r"""Return what was travelled forward, to the left, and turned (n - 1, 3) from one pose to the next, as arcs.
+
+    With the chord :math:`\Delta p` and the turn :math:`\Delta\psi`, along the axes at the mean heading of the two,
+
+    .. math:: \Delta s = \frac{\Delta\psi / 2}{\sin(\Delta\psi / 2)} R(-\bar\psi)\,\Delta p ,
+
+    so that a steady twist sums to a straight line in time, however tight the turn.
+
+    Parameters
+    ----------
+    position_m, yaw_rad : (n, 2) and (n,), the yaw without jumps of a turn
+    frame_yaw_rad : heading of the frame of the positions in that of the yaw
+
+    Examples
+    --------
+    A quarter circle of 1 m radius to the left:
+
+    >>> arcs(np.array([[0.0, 0.0], [1.0, 1.0]]), np.array([0.0, np.pi / 2])).round(4) + 0.0
+    array([[1.5708, 0.    , 1.5708]])
+    """
+    turned = np.diff(yaw_rad)
+    heading = yaw_rad[:-1] + turned / 2 - frame_yaw_rad
+    cos, sin = np.cos(heading), np.sin(heading)
+    x, y = (np.diff(position_m, axis=0) / np.sinc(turned / (2 * np.pi))[:, None]).T
+    return np.column_stack([cos * x + sin * y, cos * y - sin * x, turned])

@@ -98,8 +98,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from terrain.angles import arcs
 from terrain.errors import LogError
 from terrain.files.names import normal_name
+from terrain.kinematics.wheels import TWIST
 from terrain.logs.imu_axes import MIN_MOVING_RADPS, POWER_SIGN, current_sign, find_axes, with_sign_of_torque
 from terrain.logs.samples import (
     check_log_file,
@@ -268,7 +270,7 @@ class _Session:
                 f"{self.file}, {run_id}",
                 time_s,
                 undo_hold(values, time_s, self.holds) if name == "wheels" else values,
-                list(sources) or CHANNELS,
+                list(sources) or TWIST,
                 columns=[column for column, _ in sources.values()],
                 repairs=dropped if repair else None,
                 unknown_is_a_value=name == "lidar",
@@ -530,7 +532,7 @@ class _Recording:
         poses, self.posed, twist = self._lidar(position, *quaternion.T)
         if not np.isfinite(twist).any():
             raise LogError(f"{self.name}: its lidar has lost the robot throughout: no pose gives a speed")
-        self.streams |= {"lidar": (CHANNELS, twist), "pose": (POSE_CHANNELS, poses)}
+        self.streams |= {"lidar": (TWIST, twist), "pose": (POSE_CHANNELS, poses)}
         self.streams["commands"] = tuple(DESIRED), commands
         self.dropped[STILL] += n_still
 
@@ -588,9 +590,6 @@ class _Recording:
 
 
 # -- Held values and poses ------------------------------------------------------------------------------------
-
-CHANNELS: tuple[str, ...] = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
-"""What :func:`body_twists` returns."""
 
 MAX_HELD_S = 0.1
 """A value that is usually held for longer is read as straight lines.  Held for 0.1 s it lags by 0.025 s
@@ -695,16 +694,11 @@ def dated_poses(pose: Array, new: Array, scan: int) -> tuple[Array, Array, Array
 
 
 def body_twists(pose: Array, period_s: float, frame_yaw: Array | None = None) -> tuple[Array, Array]:
-    r"""Return speeds forward and to the left and yaw rate from poses that are held between two scans, and deviations.
+    """Return speeds forward and to the left and yaw rate from poses that are held between two scans, and deviations.
 
-    What the robot drove from one dated pose (:func:`dated_poses`) to the next, as an arc, is summed in its own axes,
-
-    .. math:: \Delta s = \frac{\Delta\psi / 2}{\sin(\Delta\psi / 2)} R(-\bar\psi)\,\Delta p, \qquad
-              \psi = \texttt{yaw} - \tfrac15 \textstyle\sum_{i<5} \texttt{yaw}_i ,
-
-    with the mean heading :math:`\bar\psi` of the two, so that a steady twist is a straight line in time,
-    however tight the turn; the sum over the first five is of the angles as published, with their jumps of a
-    full turn.  A parabola is fitted to the sums within :data:`HALF_WIDTH_SCANS` usual waits of each sample,
+    What the robot drove from one dated pose (:func:`dated_poses`) to the next, as an arc (:func:`terrain.angles.arcs`),
+    is summed in its own axes.  The heading is ``yaw`` less the mean of the first five as published, with their jumps
+    of a full turn.  A parabola is fitted to the sums within :data:`HALF_WIDTH_SCANS` usual waits of each sample,
     and its slope is the twist.  NaN where poses are too few or too much to one side for a slope
     (:data:`MAX_GAIN_PER_S`), as within three waits of a window's edge.
 
@@ -717,7 +711,7 @@ def body_twists(pose: Array, period_s: float, frame_yaw: Array | None = None) ->
 
     Returns
     -------
-    twist : (n, k, 3) of the point that the pose is of, with the channels :data:`CHANNELS`
+    twist : (n, k, 3) of the point that the pose is of, with the channels :data:`TWIST`
     std : (n, k, 3) its standard deviations by the scatter of the poses about the parabola; NaN where fewer than
         :data:`MIN_JUDGED_SCANS` poses show one
 
@@ -739,7 +733,8 @@ def body_twists(pose: Array, period_s: float, frame_yaw: Array | None = None) ->
     for window in range(n):
         at, came, _ = dated_poses(pose[window], new[window], scan)
         weight[window, at] = 1.0
-        driven[window, at] = _driven(came, frame_yaw[window])
+        steps = arcs(came[:, :2], came[:, 2], frame_yaw[window])
+        driven[window, at[1:]] = np.cumsum(steps, axis=0)
     half = HALF_WIDTH_SCANS * scan
     powers = (np.arange(-half, half + 1) / half)[:, None] ** np.arange(3)
     padding = [(0, 0), (half, half)]
@@ -762,18 +757,6 @@ def body_twists(pose: Array, period_s: float, frame_yaw: Array | None = None) ->
         spare = np.where(judged, normal[..., 0, 0] - 3.0, np.nan)
         std = np.sqrt(left / spare[..., None]) * gain_per_s[..., None]
     return np.where(certain[..., None], slope, np.nan), np.where(certain[..., None], std, np.nan)
-
-
-def _driven(pose: Array, frame_yaw: float) -> Array:
-    """Return distance forward, to the left, and yaw (m, 3), each from the first of the poses (m, 3)."""
-    turned = np.diff(pose[:, 2])
-    heading = pose[:-1, 2] + turned / 2 - frame_yaw
-    cos, sin = np.cos(heading), np.sin(heading)
-    chord = np.diff(pose[:, :2], axis=0) / np.sinc(turned / (2 * np.pi))[:, None]
-    along = np.column_stack(
-        [cos * chord[:, 0] + sin * chord[:, 1], cos * chord[:, 1] - sin * chord[:, 0], turned]
-    )
-    return np.concatenate([np.zeros((min(len(pose), 1), 3)), np.cumsum(along, axis=0)])
 
 
 def frame_coefficient(pose: Array, wheels_mps: Array, period_s: float) -> tuple[float, float]:

@@ -247,25 +247,8 @@ def shared_stretches(runs: Sequence[RunLog]) -> tuple[SharedStretch, ...]:
     >>> found.first, found.second, round(found.first_start_s), round(found.second_start_s)
     ('a', 'b', 10, 100)
     """
-    pairs, times_s = _matches(*_fingerprints(runs))
-    shared, known = [], set()
-    for first, second in dict.fromkeys(map(tuple, pairs.tolist())):
-        rows = times_s[(pairs == (first, second)).all(axis=1)]
-        stretches = _stretches(rows, runs[first], runs[second])
-        shared += stretches
-        known |= {(first, second)} if stretches else set()
-    for first, second in _same_digests(map(_digest, runs)):
-        if (first, second) not in known:
-            ids = runs[first].run_id, runs[second].run_id
-            shared.append(SharedStretch(*ids, *_span(runs[first]), *_span(runs[second])))
-    return tuple(sorted(shared))
-
-
-def _matches(codes: Array, start: Array, peaks: Array) -> tuple[Array, Array]:
-    """Return where two runs have one fingerprint, and heights and times of its peaks agree, in order of time.
-
-    Returned are the places of both runs (m, 2), and start and end of the peaks in the first and in the second (m, 4).
-    """
+    codes, start, peaks = _fingerprints(runs)
+    # where two runs have one fingerprint, and heights and times of its peaks agree
     a, b = (peaks[start[at][:, None] + np.arange(N_PEAKS)] for at in _equal(codes, peaks["run"][start]))
     (of_a, a_varies), (of_b, b_varies) = _scaled_heights(a), _scaled_heights(b)
     agree = a_varies & b_varies & (np.einsum("ij,ij->i", of_a, of_b) > MIN_CORRELATION)
@@ -278,7 +261,18 @@ def _matches(codes: Array, start: Array, peaks: Array) -> tuple[Array, Array]:
     pairs = np.column_stack([a["run"][:, 0], b["run"][:, 0]])
     times_s = np.column_stack([each["time_s"][:, i] for each in (a, b) for i in (0, -1)])
     order = np.lexsort((times_s[:, 0], pairs[:, 1], pairs[:, 0]))
-    return pairs[order], times_s[order]
+    pairs, times_s = pairs[order], times_s[order]
+    shared, known = [], set()
+    for first, second in dict.fromkeys(map(tuple, pairs.tolist())):
+        rows = times_s[(pairs == (first, second)).all(axis=1)]
+        stretches = _stretches(rows, runs[first], runs[second])
+        shared += stretches
+        known |= {(first, second)} if stretches else set()
+    for first, second in _same_digests(map(_digest, runs)):
+        if (first, second) not in known:
+            ids = runs[first].run_id, runs[second].run_id
+            shared.append(SharedStretch(*ids, *_span(runs[first]), *_span(runs[second])))
+    return tuple(sorted(shared))
 
 
 def _stretches(rows: Array, first: RunLog, second: RunLog) -> list[SharedStretch]:
@@ -324,13 +318,13 @@ def distinct_runs(runs: Sequence[RunLog], *, merge: bool) -> tuple[list[RunLog],
     stretches = shared_stretches(runs)
     if not stretches:
         return list(runs), ()
-    _refuse_other_labels(runs, stretches)
+    merged = merge_runs(runs, stretches)
     if not merge:
         raise DataError(
             f"{'; '.join(sentences(stretches))}: held out, they would be recognised and not classified; remove "
             "one of them, or use --merge-duplicates to treat them as one run"
         )
-    return merge_runs(runs, stretches), groups_of(stretches)
+    return merged, groups_of(stretches)
 
 
 def sentences(stretches: Sequence[SharedStretch]) -> list[str]:
@@ -385,8 +379,23 @@ def merge_runs(runs: Sequence[RunLog], stretches: Sequence[SharedStretch]) -> li
     >>> [run.run_id for run in merge_runs([a, b], [SharedStretch("a", "b", 0.0, 3.0, 0.0, 3.0)])]
     ['a']
     """
-    _refuse_other_labels(runs, stretches)
     merged = {run.run_id: run for run in runs}
+    for stretch in stretches:
+        labels_of = []
+        for name in (stretch.first, stretch.second):
+            start_s, stop_s = stretch.of(name)
+            margin_s = min(LABEL_MARGIN_S, (stop_s - start_s) / 4)
+            inside = [
+                label.terrain
+                for label in merged[name].labels
+                if label.start_s < stop_s - margin_s and label.end_s > start_s + margin_s
+            ]
+            labels_of.append(list(dict.fromkeys(inside)))
+        if all(labels_of) and labels_of[0] != labels_of[1]:
+            raise DataError(
+                f"runs {stretch.first} and {stretch.second} hold the same measurements under the labels "
+                f"{' and '.join(labels_of[0])} and {' and '.join(labels_of[1])}: correct one, or remove a run"
+            )
     for group in groups_of(stretches):
         members = [merged.pop(run.run_id) for run in runs if run.run_id in group]
         first, *others = sorted(members, key=lambda run: not run.labels)  # stable
@@ -434,24 +443,3 @@ def _append(
         if each.start_s < stop_s and each.end_s > start_s
     ]
     return shift_s + stop_s
-
-
-def _refuse_other_labels(runs: Sequence[RunLog], stretches: Sequence[SharedStretch]) -> None:
-    """Refuse runs that hold the same measurements under different labels."""
-    by_id = {run.run_id: run for run in runs}
-    for stretch in stretches:
-        labels = []
-        for name in (stretch.first, stretch.second):
-            start_s, end_s = stretch.of(name)
-            margin_s = min(LABEL_MARGIN_S, (end_s - start_s) / 4)
-            inside = [
-                label.terrain
-                for label in by_id[name].labels
-                if label.start_s < end_s - margin_s and label.end_s > start_s + margin_s
-            ]
-            labels.append(list(dict.fromkeys(inside)))
-        if all(labels) and labels[0] != labels[1]:
-            raise DataError(
-                f"runs {stretch.first} and {stretch.second} hold the same measurements under the labels "
-                f"{' and '.join(labels[0])} and {' and '.join(labels[1])}: correct one, or remove a run"
-            )

@@ -367,18 +367,46 @@ def read_run(
     """
     words, places = files
     dropped: Counter[str] = Counter()
+    repairs = dropped if repair else None
     streams: dict[str, Stream] = {}
     names = []
     for name, stream in mapping.streams.items():
         path = folder / places.get(name, stream.file.format(**words))
         check_log_file(path, path.parent if linked_folders else folder)
         names.append(path.relative_to(folder).as_posix())
-        if stream.messages is None:
-            streams[name] = _table_stream(path, stream, dropped if repair else None)
-        elif read_messages is None:
-            raise ConfigError(f"stream {name}: files of messages are not read here")
-        else:
-            streams[name] = read_messages(path, name, stream.messages, dropped if repair else None)
+        if stream.messages is not None:
+            if read_messages is None:
+                raise ConfigError(f"stream {name}: files of messages are not read here")
+            streams[name] = read_messages(path, name, stream.messages, repairs)
+            continue
+        assert stream.time is not None
+        position, sources = stream.position, [stream.time, *stream.channels.values()]
+        placed = []
+        if position is not None:
+            placed = [position.latitude, position.longitude, *filter(None, [position.height])]
+        layout = TextLayout(stream.delimiter, stream.decimal, stream.skip_rows, stream.header_rows)
+        columns = [normal_name(each) for each in (*(source.column for source in sources), *placed)]
+        table = read_table(path, columns, layout=layout, sheet=stream.sheet, repairs=repairs).T
+        time_s, *values = (source.si(row, source.unit) for row, source in zip(table, sources, strict=False))
+        if position is not None:
+            degrees, to_rad = table[len(sources) :], UNIT_SCALES[position.unit][1]
+            origin = np.multiply(position.origin, (to_rad, to_rad, 1.0)) if position.origin else ()
+            try:
+                height_m = degrees[2] if position.height else None
+                metres = local_metres(to_rad * degrees[0], to_rad * degrees[1], height_m, origin)
+            except LogError as error:
+                raise LogError(f"{short_name(path)}: {error}") from error
+            values += [*metres.T[: len(degrees)]]
+            placed[:2] = placed[1::-1]  # east is of the longitude
+        streams[name] = checked_stream(
+            short_name(path),
+            time_s,
+            np.column_stack(values),
+            [*stream.channels, *POSITION_CHANNELS[: len(placed)]],
+            row_of=partial(row_number, path, layout=layout),
+            columns=[*(source.column for source in sources[1:]), *placed],
+            repairs=repairs,
+        )
     run_id = (mapping.run_id or "_".join(f"{{{word}}}" for word in words)).format(**words)
     refuse_apart(run_id, streams)
     terrain = mapping.terrain.format(**words)
@@ -386,37 +414,6 @@ def read_run(
     source = f"{' and '.join(dict.fromkeys(names))}, {by}"
     run = RunLog(run_id, mapping.robot, streams, labels, source, dropped)
     return checked_names(f"run {shown(run_id)}", run)
-
-
-def _table_stream(path: Path, stream: TableStream, repairs: Counter[str] | None) -> Stream:
-    assert stream.time is not None
-    position, sources = stream.position, [stream.time, *stream.channels.values()]
-    placed = []
-    if position is not None:
-        placed = [position.latitude, position.longitude, *filter(None, [position.height])]
-    layout = TextLayout(stream.delimiter, stream.decimal, stream.skip_rows, stream.header_rows)
-    names = [normal_name(name) for name in (*(source.column for source in sources), *placed)]
-    table = read_table(path, names, layout=layout, sheet=stream.sheet, repairs=repairs).T
-    time_s, *values = (source.si(row, source.unit) for row, source in zip(table, sources, strict=False))
-    if position is not None:
-        degrees, to_rad = table[len(sources) :], UNIT_SCALES[position.unit][1]
-        origin = np.multiply(position.origin, (to_rad, to_rad, 1.0)) if position.origin else ()
-        try:
-            height_m = degrees[2] if position.height else None
-            metres = local_metres(to_rad * degrees[0], to_rad * degrees[1], height_m, origin)
-        except LogError as error:
-            raise LogError(f"{short_name(path)}: {error}") from error
-        values += [*metres.T[: len(degrees)]]
-        placed[:2] = placed[1::-1]  # east is of the longitude
-    return checked_stream(
-        short_name(path),
-        time_s,
-        np.column_stack(values),
-        [*stream.channels, *POSITION_CHANNELS[: len(placed)]],
-        row_of=partial(row_number, path, layout=layout),
-        columns=[*(source.column for source in sources[1:]), *placed],
-        repairs=repairs,
-    )
 
 
 def local_metres(
@@ -725,8 +722,38 @@ def mapped_streams(
         of_topic[topic].take(log_ns, content)
     raw = {}
     for name, source in sources.items():
-        by_header = (source.stream.time or mapping.time) == "header"
-        raw[name] = _joined(place, name, source, of_topic, by_header, faults)
+        stream = source.stream
+        by_header = (stream.time or mapping.time) == "header"
+        stamps_ns, values = list[Array](), list[Array]()
+        for topic, paths in source.paths.items():
+            stamp_ns, numbers = of_topic[topic].numbers(paths, by_header=by_header)
+            if not stamp_ns.size:
+                what = " with any of the joints" if stream.kind == "joints" else ""
+                raise LogError(f"{place}: topic {shown(topic)} has no message{what}")
+            order = np.argsort(stamp_ns, kind="stable") if len(source.paths) > 1 else slice(None)
+            stamps_ns.append(stamp_ns[order])
+            values.append(numbers[order])
+        common = stamps_ns[0]
+        if len(stamps_ns) > 1 and stream.join == "previous":
+            for i, each in enumerate(stamps_ns[1:], start=1):
+                row = np.searchsorted(each, common, side="right") - 1
+                values[i] = np.where((row >= 0)[:, None], values[i][np.maximum(row, 0)], np.nan)
+        elif len(stamps_ns) > 1:
+            for each in stamps_ns[1:]:
+                common = np.intersect1d(common, each)
+            if n_lost := sum(each.size for each in stamps_ns) - common.size * len(stamps_ns):
+                lost = f"{n_lost} messages of {' and '.join(shown(topic) for topic in source.paths)}"
+                text = f"{name}: {lost} lack one of equal stamp (join: previous)"
+                faults.found(place, UNMATCHED, text, n_lost)
+            if not common.size:
+                raise LogError(f"{place}: stream {name}: no two stamps of its topics agree (join: previous)")
+            values = [
+                value[np.searchsorted(each, common)] for value, each in zip(values, stamps_ns, strict=True)
+            ]
+        channels, joined = source.channels(np.concatenate(values, axis=1))
+        if not channels:
+            raise LogError(f"{place}: topic {shown(stream.topic)} states that it measures nothing")
+        raw[name] = common, channels, joined
     if start_ns is None:
         stamps = [stamp_ns for stamp_ns, *_ in raw.values()]
         firsts = [each.min() if repairs is None else each[longest_rise(each)[0]] for each in stamps]
@@ -739,46 +766,6 @@ def mapped_streams(
         streams[name] = checked_stream(at, (stamp_ns - start_ns) / 1e9, values, channels, repairs=repairs)
     texts = sorted(of_topic[labels].texts, key=lambda each: each[0]) if labels else []
     return streams, label_intervals(texts, start_ns, streams)
-
-
-def _joined(
-    place: str,
-    name: str,
-    source: _Source,
-    of_topic: Mapping[str, _TopicNumbers],
-    by_header: bool,
-    faults: Faults,
-) -> tuple[Array, tuple[str, ...], Array]:
-    """Return the stamps (n,) in ns, the channels and the values (n, c) of a stream, joined of its topics."""
-    stream = source.stream
-    stamps, values = list[Array](), list[Array]()
-    for topic, paths in source.paths.items():
-        stamp_ns, numbers = of_topic[topic].numbers(paths, by_header=by_header)
-        if not stamp_ns.size:
-            what = " with any of the joints" if stream.kind == "joints" else ""
-            raise LogError(f"{place}: topic {shown(topic)} has no message{what}")
-        order = np.argsort(stamp_ns, kind="stable") if len(source.paths) > 1 else slice(None)
-        stamps.append(stamp_ns[order])
-        values.append(numbers[order])
-    common = stamps[0]
-    if len(stamps) > 1 and stream.join == "previous":
-        for i, each in enumerate(stamps[1:], start=1):
-            row = np.searchsorted(each, common, side="right") - 1
-            values[i] = np.where((row >= 0)[:, None], values[i][np.maximum(row, 0)], np.nan)
-    elif len(stamps) > 1:
-        for each in stamps[1:]:
-            common = np.intersect1d(common, each)
-        if n_lost := sum(each.size for each in stamps) - common.size * len(stamps):
-            lost = f"{n_lost} messages of {' and '.join(shown(topic) for topic in source.paths)}"
-            text = f"{name}: {lost} lack one of equal stamp (join: previous)"
-            faults.found(place, UNMATCHED, text, n_lost)
-        if not common.size:
-            raise LogError(f"{place}: stream {name}: no two stamps of its topics agree (join: previous)")
-        values = [value[np.searchsorted(each, common)] for value, each in zip(values, stamps, strict=True)]
-    channels, joined = source.channels(np.concatenate(values, axis=1))
-    if not channels:
-        raise LogError(f"{place}: topic {shown(stream.topic)} states that it measures nothing")
-    return common, channels, joined
 
 
 def _fields_source(at: str, stream: MessageStream, wheel_radius_m: float | None) -> _Source:

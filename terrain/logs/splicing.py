@@ -127,35 +127,29 @@ def splice_runs(parts: Sequence[Part], channels: Mapping[str, Sequence[str]], ru
     if not parts:
         raise DataError(f"{run_id}: there is no part to splice")
     begins_s = np.concatenate(([0.0], np.cumsum([part.end_s - part.start_s for part in parts]))).tolist()
-    streams = {name: _spliced(parts, begins_s, name, tuple(names)) for name, names in channels.items()}
+    streams = {}
+    for name, names in channels.items():
+        times: list[Array] = []
+        values: list[Array] = []
+        for part, begin_s in zip(parts, begins_s, strict=False):
+            stream, shift_s = part.run.streams[name], begin_s - part.start_s
+            ends_s = np.array([part.start_s, part.end_s]) - TIME_TOLERANCE_S
+            first, end = np.searchsorted(stream.time_s, ends_s)
+            if first == end:
+                raise DataError(
+                    f"run {part.run.run_id}: no sample of stream {name!r} from {part.start_s:g} to "
+                    f"{part.end_s:g} s"
+                )
+            if times:
+                period_s, before_s = 1.0 / stream.rate_hz, times[-1][-1]
+                distance_s = stream.time_s[first] + shift_s - before_s
+                if distance_s < LEAST_PERIODS * period_s and first + 1 < end:
+                    first += 1
+                elif distance_s > MOST_PERIODS * period_s and first > 0:
+                    first -= int(stream.time_s[first - 1] + shift_s - before_s > TIME_TOLERANCE_S)
+            order = [stream.channels.index(channel) for channel in names]
+            times.append(stream.time_s[first:end] + shift_s)
+            values.append(stream.values[first:end][:, order])
+        streams[name] = Stream(np.concatenate(times), np.concatenate(values), tuple(names))
     labels = tuple(map(Label, begins_s, begins_s[1:], [part.terrain for part in parts]))
     return RunLog(run_id, parts[0].run.robot, streams, labels, source="spliced from parts of runs")
-
-
-def _spliced(
-    parts: Sequence[Part], begins_s: Sequence[float], name: str, channels: tuple[str, ...]
-) -> Stream:
-    times: list[Array] = []
-    values: list[Array] = []
-    before_s = -np.inf
-    for part, begin_s in zip(parts, begins_s, strict=False):
-        stream = part.run.streams[name]
-        shift_s = begin_s - part.start_s
-        first, end = np.searchsorted(stream.time_s, np.array([part.start_s, part.end_s]) - TIME_TOLERANCE_S)
-        if first == end:
-            raise DataError(
-                f"run {part.run.run_id}: no sample of stream {name!r} from {part.start_s:g} to "
-                f"{part.end_s:g} s"
-            )
-        if times:
-            period_s = 1.0 / stream.rate_hz
-            distance_s = stream.time_s[first] + shift_s - before_s
-            if distance_s < LEAST_PERIODS * period_s and first + 1 < end:
-                first += 1
-            elif distance_s > MOST_PERIODS * period_s and first > 0:
-                first -= int(stream.time_s[first - 1] + shift_s - before_s > TIME_TOLERANCE_S)
-        order = [stream.channels.index(channel) for channel in channels]
-        times.append(stream.time_s[first:end] + shift_s)
-        values.append(stream.values[first:end][:, order])
-        before_s = times[-1][-1]
-    return Stream(np.concatenate(times), np.concatenate(values), channels)

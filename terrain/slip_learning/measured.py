@@ -1,12 +1,8 @@
 r"""Slip of each wheel, and of the body, over windows of a run: what was rolled against what was travelled.
 
 **Travelled.**  A pose that is measured from outside (a camera above, a lidar, motion capture) gives, from one sample
-to the next, an arc: with the chord :math:`\Delta p` and the turn :math:`\Delta\psi`,
-
-.. math:: \Delta s = \frac{\Delta\psi / 2}{\sin(\Delta\psi / 2)} R(-\bar\psi)\,\Delta p ,
-
-along the axes of the body at the mean heading of the two.  The sums of a steady motion are straight lines in
-time, however tight the turn, so that a slope over a window is the mean twist of it.  A stream of speeds over ground
+to the next, an arc (:func:`terrain.angles.arcs`), whose sums are straight lines in time while the motion is steady, so
+that a slope over a window is the mean twist of it.  A stream of speeds over ground
 is integrated.  A receiver of satellites measures a velocity without a heading: of a robot that cannot drive sideways
 it is taken along its x axis, forward where the wheels roll forward, and the turn by the gyro where there is one.
 Where a measurement pauses or jumps (a camera that loses the robot, a scan that is matched elsewhere) nothing
@@ -66,6 +62,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from terrain.angles import arcs
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
@@ -169,14 +166,9 @@ def travelled(run: RunLog, robot: Robot, delay_s: float = 0.0) -> Travelled:
         return Travelled(name, time_s, np.zeros((len(time_s), 3)), np.zeros(len(time_s), np.int64), 0, 0)
     step_s = np.diff(time_s)
     if by_pose:
-        yaw = np.unwrap(values[:, 2])
-        turned, chord = np.diff(yaw), np.diff(values[:, :2], axis=0)
-        heading = yaw[:-1] + turned / 2
-        cos, sin = np.cos(heading), np.sin(heading)
-        x, y = (chord / np.sinc(turned / (2 * np.pi))[:, None]).T
-        steps, gap = np.column_stack([cos * x + sin * y, cos * y - sin * x, turned]), step_s > MAX_GAP_S
+        steps, gap = arcs(values[:, :2], np.unwrap(values[:, 2])), step_s > MAX_GAP_S
         far_m = MAX_SPEED_RATIO * _fastest_mps(run, robot) * step_s + MAX_JUMP_M
-        jumped = ~gap & (np.linalg.norm(chord, axis=1) > far_m)
+        jumped = ~gap & (np.linalg.norm(np.diff(values[:, :2], axis=0), axis=1) > far_m)
     else:
         steps, gap = step_s[:, None] * (values[1:] + values[:-1]) / 2.0, step_s > max(1.5 * usual_s, 1e-3)
         jumped = np.zeros(len(gap), dtype=bool)
