@@ -131,7 +131,15 @@ def time_constants(events: Sequence[Event]) -> list[Finding]:
         (True, [event.wheels for event in events]),
         (False, [event.camera for event in events]),
     ):
-        signals = [_behind_reference(*pair) for pair in zip(events, speeds, strict=True)]
+        signals = []  # of each event speeds behind the accelerometer's own lag, and on a grid what may explain them
+        for event, (time_s, speed_mps) in zip(events, speeds, strict=True):
+            gained = cumulative_trapezoid(event.accel_mps2, event.time_s, initial=0.0)
+            edge = max(len(time_s) // 8, 1)
+            first, last = speed_mps[:edge].mean(), speed_mps[-edge:].mean()
+            ramp = np.linspace(0.0, 1.0, len(gained))
+            slip = np.abs(first + gained + (last - first - gained[-1]) * ramp) * event.accel_mps2
+            columns = np.array([event.time_s, gained, event.time_s - event.time_s[0], slip])
+            signals.append((time_s, low_passed(time_s, speed_mps, REFERENCE_LAG_S, LEVEL_S), columns))
         number = np.repeat(np.arange(len(events)), [len(time_s) for time_s, _ in speeds])
         fits.append(identify(partial(_residual, signals, slips), [LAG], number))
     encoder, camera = ((float(fit.value[0]), fit.influence[:, 0]) for fit in fits)
@@ -149,23 +157,12 @@ def time_constants(events: Sequence[Event]) -> list[Finding]:
     return found
 
 
-def _behind_reference(event: Event, speed: tuple[Array, Array]) -> tuple[Array, Array, Array]:
-    """Return the stamps and the speed (n,), behind the accelerometer's own lag, and what may explain it (m, 4).
-
-    That is on a grid: time, what the acceleration gained, slip's part but for its factor, and the time of the event.
-    """
-    time_s, speed_mps = speed
-    gained = cumulative_trapezoid(event.accel_mps2, event.time_s, initial=0.0)
-    n = max(len(time_s) // 8, 1)
-    first, last = speed_mps[:n].mean(), speed_mps[-n:].mean()
-    absolute = np.abs(first + gained + (last - first - gained[-1]) * np.linspace(0.0, 1.0, len(gained)))
-    slip, ramp = absolute * event.accel_mps2, event.time_s - event.time_s[0]
-    behind = low_passed(time_s, speed_mps, REFERENCE_LAG_S, LEVEL_S)
-    return time_s, behind, np.array([event.time_s, gained, ramp, slip])
-
-
 def _residual(signals: Sequence[tuple[Array, Array, Array]], slips: bool, lag_s: Array) -> Array:
-    """Return the speeds less what level, gain and offset of each event explain at a lag, and one slip of all."""
+    """Return the speeds less what level, gain and offset of each event explain at a lag, and one slip of all.
+
+    Of each event ``signals`` are stamps and speed (n,) and, on a grid, time, what the acceleration gained, time of the
+    event, and slip's part but for its factor (4, m).
+    """
     slip, left = [], []
     for time_s, speed, (grid_s, *columns) in signals:
         gained, ramp, own = (

@@ -100,7 +100,13 @@ def legs_over(
         raise DataError(f"run {run.run_id!r} has no gyro_z_radps, which odometry with slip needs")
     for start_s, end_s, moved in spans:
         from_s, to_s, n = start_s - delay_s, end_s - delay_s, max(math.ceil((end_s - start_s) / STEP_S), 1)
-        if any(_has_gap(time_s[known[:, column]], from_s, to_s) for column in (0, 1, 2)):
+        gaps = False  # a run may begin a delay after the first
+        for column in (0, 1, 2):
+            stamps_s = time_s[known[:, column]]
+            inside = stamps_s[(stamps_s > from_s - GAP_S) & (stamps_s < to_s + GAP_S)]
+            gaps |= len(inside) < 2 or bool(np.diff(inside).max() > GAP_S)
+            gaps |= not gaps and bool(inside[-1] < to_s - GAP_S or inside[0] > from_s + MAX_WINDOW_GAP_S)
+        if gaps:
             found.append(None)
             continue
         step_s = (end_s - start_s) / n
@@ -112,31 +118,6 @@ def legs_over(
         speeds, tilts = np.column_stack([left, right]), np.column_stack(tilt)
         found.append(Leg(number, moved, step_s, speeds, rate, tilts, end_s - start_s))
     return found
-
-
-def _has_gap(time_s: Array, from_s: float, to_s: float) -> bool:
-    """Return whether samples leave a gap between two times; a run may begin a delay after the first."""
-    inside = time_s[(time_s > from_s - GAP_S) & (time_s < to_s + GAP_S)]
-    if len(inside) < 2:
-        return True
-    return bool(
-        np.diff(inside).max() > GAP_S or inside[-1] < to_s - GAP_S or inside[0] > from_s + MAX_WINDOW_GAP_S
-    )
-
-
-def legs_of_windows(
-    run: RunLog, number: int, windows: Sequence[WindowPoses], robot: TrackedRobot, delay_s: float
-) -> tuple[list[Leg], list[Leg]]:
-    """Return the legs of a command's windows, and that of all of them in a row; none where they have gaps."""
-    spans, origins = (
-        [(each.time_s[0], each.time_s[-1], each.pose[-1]) for each in windows],
-        window_origins(run, windows),
-    )
-    if len(origins) > 1:
-        spans.append((spans[0][0], spans[-1][1], composed(origins[-1], windows[-1].pose[-1])))
-    legs = legs_over(run, number, robot, spans, delay_s)
-    single, whole = legs[: len(windows)], legs[len(windows) :]
-    return [leg for leg in single if leg is not None], [leg for leg in whole if leg is not None]
 
 
 def window_origins(run: RunLog, windows: Sequence[WindowPoses]) -> list[Array]:
@@ -172,14 +153,11 @@ def legs_of_poses(run: RunLog, number: int, robot: TrackedRobot, length_s: float
         last = min(last, len(time_s) - 1)
         late_s = max(time_s[first] - begin_s, abs(time_s[last] - begin_s - length_s))
         if late_s <= GAP_S:  # else no pose there
-            (x, y, turn), cos, sin = values[last] - values[first], *_direction(values[first, 2])
+            x, y, turn = values[last] - values[first]
+            cos, sin = math.cos(values[first, 2]), math.sin(values[first, 2])
             moved = np.array([cos * x + sin * y, cos * y - sin * x, turn])
             spans.append((time_s[first], time_s[last], moved))
     return [leg for leg in legs_over(run, number, robot, spans, 0.0) if leg is not None]
-
-
-def _direction(angle_rad: float) -> tuple[float, float]:
-    return float(np.cos(angle_rad)), float(np.sin(angle_rad))
 
 
 def composed(first: Array, then: Array) -> Array:
@@ -190,7 +168,7 @@ def composed(first: Array, then: Array) -> Array:
     >>> composed(np.array([1.0, 0.0, np.pi / 2]), np.array([1.0, 0.0, 0.0])).round(6).tolist()
     [1.0, 1.0, 1.570796]
     """
-    cos, sin = _direction(first[2])
+    cos, sin = math.cos(first[2]), math.sin(first[2])
     x, y = cos * then[0] - sin * then[1], sin * then[0] + cos * then[1]
     return np.array([first[0] + x, first[1] + y, first[2] + then[2]])
 
@@ -487,16 +465,18 @@ def judge_odometry(
     delay_s, groups = 0.0, dict[str, list[Leg]]()
     if windows:
         delay_s = robot.identified.get("lidar_delay_s", 0.0)
-        both = [
-            legs_of_windows(run, number, windows.get(run.run_id, ()), robot, delay_s)
-            for number, run in enumerate(runs)
-        ]
-        single, chained = (list(itertools.chain.from_iterable(part)) for part in zip(*both, strict=True))
+        single, chained = list[Leg](), list[Leg]()
+        for number, run in enumerate(runs):
+            own = windows.get(run.run_id, ())
+            spans, origins = [(w.time_s[0], w.time_s[-1], w.pose[-1]) for w in own], window_origins(run, own)
+            if len(origins) > 1:  # all of them in a row
+                spans.append((spans[0][0], spans[-1][1], composed(origins[-1], own[-1].pose[-1])))
+            for place, leg in enumerate(legs_over(run, number, robot, spans, delay_s)):
+                if leg is not None:
+                    (single if place < len(own) else chained).append(leg)
         longest_s = max((leg.length_s for leg in chained), default=0.0)
-        groups = {
-            "window": single,
-            "command": [leg for leg in chained if leg.length_s > SHORT_RATIO * longest_s],
-        }
+        whole = [leg for leg in chained if leg.length_s > SHORT_RATIO * longest_s]
+        groups = {"window": single, "command": whole}
     for length_s in () if windows else lengths_s:
         groups[f"{length_s:g} s"] = [
             leg

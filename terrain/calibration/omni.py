@@ -51,13 +51,57 @@ def identify_omni(runs: Sequence[RunLog], robot: OmniRobot, seed: int = 0) -> li
     """Return a finding for each number of an omni robot that runs can determine.
 
     They are of motors alone, driving runs under a camera, or both; runs of a session (with weights, say) are not those
-    of the robot as described, and are left out.
+    of the robot as described, and are left out.  Loads sum to 1, so that the centre of mass is
+    ``q + sum n_i (p_i - q)`` for any point q: the best of the wheels bounds it.
     """
     alone = [run for run in runs if outside_source(run) is None and not run.terrains]
     own = [
         run for run in runs if outside_source(run) is not None and not run.session and len(run.terrains) == 1
     ]
-    return [motor_friction(alone, robot), *_driven(own, robot, seed)]
+    friction = motor_friction(alone, robot)
+    measured = measure(own, robot, window_s=WINDOW_S, stride_s=STRIDE_S, seed=seed)
+    surfaces = {
+        name: on_it
+        for name, on_it in measured.by_terrain().items()
+        if sum(bool(slip.known.size) for slip in on_it.slips) >= MIN_RUNS
+    }
+    if not surfaces:
+        reason = f"no surface on which {MIN_RUNS} runs in steady motion were measured from outside"
+        return [friction, *undetermined([COM_X, COM_Y, RADIUS, DISTANCE], reason)]
+    chosen = [
+        pair for pair in zip(measured.runs, measured.slips, strict=True) if pair[0].terrains[0] in surfaces
+    ]
+    names, ids = [run.terrains[0] for run, _ in chosen], [run.run_id for run, _ in chosen]
+    found = roller_findings([slip for _, slip in chosen], names, robot, list(surfaces))
+    loads = "by the loads " + ", ".join(f"{load:.3f}" for load in found.load_ratio) + " of the wheels"
+    place_m, half = robot.wheel_positions_m, np.diff(found.load_interval)[:, 0] / 2
+    apart_m = np.abs(place_m - place_m[:, None])  # q at each of the wheels
+    centre = np.array(found.load_ratio) @ place_m, np.einsum("i,qia->qa", half, apart_m).min(axis=0)
+    findings = [friction] + [
+        around(name, m, half_m, len(ids), "runs", ids, loads)
+        for name, m, half_m in zip((COM_X, COM_Y), *centre, strict=True)
+    ]
+    ratio, (low, high) = found.scale_error, found.scale_interval
+    value, least, most = ((1.0 - each) * robot.wheel_radius_m for each in (ratio, high, low))
+    or_scale = "or the scale of the outside measurement is off by as much: the runs do not distinguish them"
+    findings.append(Finding(RADIUS, value, least, most, len(ids), "runs", tuple(ids), or_scale))
+    bounds = {name: bound for name, bound in distances_of(measured, robot, seed).items() if name in surfaces}
+    if not bounds:
+        return [*findings, *undetermined([DISTANCE], "on no surface do the robot's turns follow its wheels")]
+    each = ", ".join(f"{bound.distance_m:.4f} m on {name}" for name, bound in bounds.items())
+    low, high = np.array([bound.interval_m for bound in bounds.values()]).T
+    distance = Finding(
+        DISTANCE,
+        float(np.mean([bound.distance_m for bound in bounds.values()])),
+        float(low.min()),
+        float(high.max()),
+        sum(bound.n_runs for bound in bounds.values()),
+        "runs",
+        tuple(slip.run_id for name in bounds for slip in surfaces[name].slips),
+        f"{each}: too large by the slip of turning, and off by what else turns the robot; the interval "
+        "holds those of all surfaces",
+    )
+    return [*findings, distance]
 
 
 def motor_friction(runs: Sequence[RunLog], robot: OmniRobot) -> Finding:
@@ -109,54 +153,3 @@ def no_load_lines(run: RunLog, robot: OmniRobot) -> list[tuple[float, float, int
             return []
         lines.append((rest_a, slope, len(speed)))
     return lines
-
-
-def _driven(runs: Sequence[RunLog], robot: OmniRobot, seed: int) -> list[Finding]:
-    """Return what driving runs under a camera show: centre of mass, rolling radius and distance of the wheels.
-
-    Loads sum to 1, so that the centre of mass is ``q + sum n_i (p_i - q)`` for any point q: the best of the wheels
-    bounds it.
-    """
-    measured = measure(runs, robot, window_s=WINDOW_S, stride_s=STRIDE_S, seed=seed)
-    surfaces = {
-        name: own
-        for name, own in measured.by_terrain().items()
-        if sum(bool(slip.known.size) for slip in own.slips) >= MIN_RUNS
-    }
-    if not surfaces:
-        reason = f"no surface on which {MIN_RUNS} runs in steady motion were measured from outside"
-        return undetermined([COM_X, COM_Y, RADIUS, DISTANCE], reason)
-    chosen = [
-        pair for pair in zip(measured.runs, measured.slips, strict=True) if pair[0].terrains[0] in surfaces
-    ]
-    names, ids = [run.terrains[0] for run, _ in chosen], [run.run_id for run, _ in chosen]
-    found = roller_findings([slip for _, slip in chosen], names, robot, list(surfaces))
-    loads = "by the loads " + ", ".join(f"{load:.3f}" for load in found.load_ratio) + " of the wheels"
-    place_m, half = robot.wheel_positions_m, np.diff(found.load_interval)[:, 0] / 2
-    apart_m = np.abs(place_m - place_m[:, None])  # q at each of the wheels
-    centre = np.array(found.load_ratio) @ place_m, np.einsum("i,qia->qa", half, apart_m).min(axis=0)
-    findings = [
-        around(name, m, half_m, len(ids), "runs", ids, loads)
-        for name, m, half_m in zip((COM_X, COM_Y), *centre, strict=True)
-    ]
-    ratio, (low, high) = found.scale_error, found.scale_interval
-    value, least, most = ((1.0 - each) * robot.wheel_radius_m for each in (ratio, high, low))
-    or_scale = "or the scale of the outside measurement is off by as much: the runs do not distinguish them"
-    findings.append(Finding(RADIUS, value, least, most, len(ids), "runs", tuple(ids), or_scale))
-    bounds = {name: bound for name, bound in distances_of(measured, robot, seed).items() if name in surfaces}
-    if not bounds:
-        return [*findings, *undetermined([DISTANCE], "on no surface do the robot's turns follow its wheels")]
-    each = ", ".join(f"{bound.distance_m:.4f} m on {name}" for name, bound in bounds.items())
-    low, high = np.array([bound.interval_m for bound in bounds.values()]).T
-    distance = Finding(
-        DISTANCE,
-        float(np.mean([bound.distance_m for bound in bounds.values()])),
-        float(low.min()),
-        float(high.max()),
-        sum(bound.n_runs for bound in bounds.values()),
-        "runs",
-        tuple(slip.run_id for name in bounds for slip in surfaces[name].slips),
-        f"{each}: too large by the slip of turning, and off by what else turns the robot; the interval "
-        "holds those of all surfaces",
-    )
-    return [*findings, distance]

@@ -350,7 +350,9 @@ def sensor_noise(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
             if signal is not None:
                 n += len(signal)
                 runs.append(stretch.run.run_id)
-                left += [_about_a_line(batch) for batch in batches(signal)]
+                for batch in batches(signal):  # about the straight line that fits each channel best
+                    x, centred = np.linspace(-1.0, 1.0, len(batch))[:, None], batch - batch.mean(axis=0)
+                    left.append(centred - x * (x * centred).sum(axis=0) / (x**2).sum())
         found.append(_noise(parameter, left, n, runs, robot))
     return found
 
@@ -382,13 +384,6 @@ def _noise(parameter: str, residuals: Sequence[Array], n: int, runs: Sequence[st
             return undetermined([parameter], f"the noise hides below the encoder's step of {step:.2g} rad")[0]
     value, low, high = (math.sqrt(max(x - step_variance, 0.0)) for x in (variance, low**2, high**2))
     return Finding(parameter, value, low, high, n, "samples", tuple(dict.fromkeys(runs)))
-
-
-def _about_a_line(batch: Array) -> Array:
-    """Return a batch (k, channels) without the straight line that fits each channel best."""
-    x = np.linspace(-1.0, 1.0, len(batch))[:, None]
-    centred = batch - batch.mean(axis=0)
-    return np.asarray(centred - x * (x * centred).sum(axis=0) / (x**2).sum())
 
 
 def measurement_variances(robot: Robot, floor: float = NOISE_FLOOR) -> dict[str, float]:

@@ -724,20 +724,20 @@ def mapped_streams(
     for name, source in sources.items():
         stream = source.stream
         by_header = (stream.time or mapping.time) == "header"
-        stamps_ns, values = list[Array](), list[Array]()
-        for topic, paths in source.paths.items():
-            stamp_ns, numbers = of_topic[topic].numbers(paths, by_header=by_header)
+        stamps_ns, parts = list[Array](), list[Array]()
+        for topic, places in source.paths.items():
+            stamp_ns, found = of_topic[topic].numbers(places, by_header=by_header)
             if not stamp_ns.size:
                 what = " with any of the joints" if stream.kind == "joints" else ""
                 raise LogError(f"{place}: topic {shown(topic)} has no message{what}")
             order = np.argsort(stamp_ns, kind="stable") if len(source.paths) > 1 else slice(None)
             stamps_ns.append(stamp_ns[order])
-            values.append(numbers[order])
+            parts.append(found[order])
         common = stamps_ns[0]
         if len(stamps_ns) > 1 and stream.join == "previous":
             for i, each in enumerate(stamps_ns[1:], start=1):
                 row = np.searchsorted(each, common, side="right") - 1
-                values[i] = np.where((row >= 0)[:, None], values[i][np.maximum(row, 0)], np.nan)
+                parts[i] = np.where((row >= 0)[:, None], parts[i][np.maximum(row, 0)], np.nan)
         elif len(stamps_ns) > 1:
             for each in stamps_ns[1:]:
                 common = np.intersect1d(common, each)
@@ -747,10 +747,9 @@ def mapped_streams(
                 faults.found(place, UNMATCHED, text, n_lost)
             if not common.size:
                 raise LogError(f"{place}: stream {name}: no two stamps of its topics agree (join: previous)")
-            values = [
-                value[np.searchsorted(each, common)] for value, each in zip(values, stamps_ns, strict=True)
-            ]
-        channels, joined = source.channels(np.concatenate(values, axis=1))
+            pairs = zip(parts, stamps_ns, strict=True)
+            parts = [part[np.searchsorted(each, common)] for part, each in pairs]
+        channels, joined = source.channels(np.concatenate(parts, axis=1))
         if not channels:
             raise LogError(f"{place}: topic {shown(stream.topic)} states that it measures nothing")
         raw[name] = common, channels, joined

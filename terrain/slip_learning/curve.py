@@ -455,7 +455,11 @@ def learn_curve(
         peaks.append(net_peak(partial(net, theta, again, 0.0), low, high, peak.status, 1001).slip_ratio)
         thrusts.append(traction_ratio(law, theta, slips))
         places.append([slip_at(law, theta, again + by) for by in (0.0, WORKING_TRACTION_RATIO)])
-    balance_std, working_std = (_std_over_runs(column, len(runs)) for column in np.array(places).T)
+    stds = []  # of balance and working slip: that of the draws, and what all runs share
+    for column in np.array(places).T:
+        known, spread = column[np.isfinite(column)], math.sqrt(len(runs) / (len(runs) - 1))
+        scatter = float(np.std(known)) * spread if len(known) > 1 else math.nan
+        stds.append(math.hypot(scatter, SYSTEMATIC_SLIP_STD))
     return SlipCurve(
         law=law,
         parameters=parameters,
@@ -465,21 +469,13 @@ def learn_curve(
         peak=peak,
         peak_interval=peak_interval(np.array(peaks), runs, peak, partial(net, parameters, rho), (low, high)),
         balance_slip_ratio=slip_at(law, parameters, rho),
-        balance_std=balance_std,
+        balance_std=stds[0],
         working_slip_ratio=slip_at(law, parameters, rho + WORKING_TRACTION_RATIO, high),
-        working_std=working_std,
+        working_std=stds[1],
         band=np.vstack([slips, np.quantile(thrusts, [(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], axis=0)]),
         n_runs=len(runs),
         scores={name: float(np.mean(values)) for name, values in scores.items()},
     )
-
-
-def _std_over_runs(draws: Array, n_runs: int) -> float:
-    """Return the standard deviation of a slip by its draws and what all runs share; NaN without any."""
-    known = draws[np.isfinite(draws)]
-    if len(known) < 2:
-        return math.nan
-    return math.hypot(float(np.std(known)) * math.sqrt(n_runs / (n_runs - 1)), SYSTEMATIC_SLIP_STD)
 
 
 def insufficiency(runs: Sequence[RunBins]) -> str | None:

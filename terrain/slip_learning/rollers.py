@@ -27,10 +27,10 @@ import numpy as np
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.errors import DataError
 from terrain.identify import Parameter, folds, identify
+from terrain.kinematics.wheels import rolling_matrix
 from terrain.records import Array
 from terrain.robots import OmniRobot, Robot, as_drive
 from terrain.signals import agreement
-from terrain.simulation.plants.planar import steady_twist
 from terrain.slip_learning.measured import Measured, MeasuredSlip, single_terrain
 
 N_FOLDS = 5
@@ -98,6 +98,43 @@ def loads_of(values: Array) -> Array:
     """Return the share of the weight on each wheel (3,) by the parameters."""
     share = np.array([values[0], 1.0, values[1]])
     return np.asarray(share / share.sum())
+
+
+def steady_twist(
+    wheel_speed_mps: Array,
+    positions_m: Array,
+    direction_rad: Array,
+    load_ratio: Array,
+    roller_ratio: float,
+    scale_error: float = 0.0,
+) -> Array:
+    """Return the twist (n, 3) of a body whose wheels turn at steady speeds (n, wheels).
+
+    Parameters
+    ----------
+    wheel_speed_mps : (n, wheels) circumferential
+    positions_m, direction_rad : (wheels, 2) and (wheels,) of the wheels
+    load_ratio : (wheels,) shares of the weight, summing to 1
+    roller_ratio : rho, friction of the rollers over the stiffness of traction; 0 is free
+    scale_error : kappa
+
+    Examples
+    --------
+    A wheel that rolls across entirely, and carries most of the weight, brakes the more:
+
+    >>> from terrain.robots import load_robot
+    >>> place = load_robot("robotino").wheel_positions_m, np.radians([150.0, 270.0, 390.0])
+    >>> ahead, left, _ = 0.1 * rolling_matrix(*place).T
+    >>> load = np.array([0.25, 0.5, 0.25])
+    >>> steady_twist(np.array([ahead, left]), *place, load, 0.8)[:, :2].diagonal().round(4)
+    array([0.0429, 0.0652])
+    """
+    along = rolling_matrix(positions_m, direction_rad)
+    across = rolling_matrix(positions_m, np.asarray(direction_rad) + np.pi / 2)
+    balance = (along * load_ratio[:, None]).T @ along
+    balance = balance + roller_ratio * (across * load_ratio[:, None]).T @ across
+    driven = np.asarray(wheel_speed_mps) @ (along * load_ratio[:, None])
+    return np.asarray((1.0 - scale_error) * np.linalg.solve(balance, driven.T).T)
 
 
 def law_motion(

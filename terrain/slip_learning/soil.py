@@ -247,15 +247,6 @@ class Prediction(NamedTuple):
     modulus_pa: Array
 
 
-def force_vector(law: Law, values: Array) -> Array:
-    """Return all parameters of the forces (17,), the free ones being ``values``."""
-    named = {name: entry[0] for name, entry in FORCE.items()} | dict(law.fixed)
-    named.update(zip(law.free, np.asarray(values).tolist(), strict=True))
-    if law.tied:
-        named["side_pressure_ratio"] = bulldozing_ratio(named["tan_friction"])
-    return np.array([named[name] for name in NAMES])
-
-
 def sinkage_of(law: Law, values: Array, trials: Trials, wheel: Wheel) -> Array:
     """Return the sinkage (n,) in m that a law predicts from slip and angle, and Ding's from the load."""
     radius_m = wheel.tip_radius_m
@@ -275,8 +266,12 @@ def _motion(trials: Trials) -> Array:
 
 
 def forces_of(law: Law, values: Array, trials: Trials, wheel: Wheel, sinkage_m: Array) -> Prediction:
-    """Return the forces of each trial for a sinkage (n,) in m."""
-    depths, vector = np.ascontiguousarray(sinkage_m), force_vector(law, values)
+    """Return the forces of each trial for a sinkage (n,) in m, the free parameters of the law being ``values``."""
+    named = {name: entry[0] for name, entry in FORCE.items()} | dict(law.fixed)
+    named |= dict(zip(law.free, np.asarray(values).tolist(), strict=True))
+    if law.tied:
+        named["side_pressure_ratio"] = bulldozing_ratio(named["tan_friction"])
+    depths, vector = np.ascontiguousarray(sinkage_m), np.array([named[name] for name in NAMES])
     pull, side, modulus = wheel_forces(vector, wheel.tip_radius_m, wheel.width_m, _motion(trials), depths).T
     return Prediction(pull, side, depths, modulus)
 

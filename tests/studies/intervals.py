@@ -31,7 +31,6 @@ from terrain.identify import Parameter, half_width, identify
 from terrain.kinematics.wheels import rolling_matrix
 from terrain.records import Array, Label, RunLog, Stream, TargetStatus
 from terrain.robots import description_file, load_robot
-from terrain.simulation.plants.planar import steady_twist
 from terrain.simulation.plants.tracks import PrescribedSlip
 from terrain.simulation.run import learning_runs, simulate, six_positions_log
 from terrain.simulation.scenario import make_scenario
@@ -44,7 +43,7 @@ from terrain.slip_learning.curve import (
 )
 from terrain.slip_learning.forces import RunBins
 from terrain.slip_learning.learn import learn_terrain, terrain_runs
-from terrain.slip_learning.rollers import roller_findings
+from terrain.slip_learning.rollers import roller_findings, steady_twist
 from terrain.slip_learning.soil import (
     LAWS,
     SINKAGES,

@@ -62,7 +62,7 @@ slope
 .. math:: M \dot V = \sum_i D_i^T (F_i - R_i) + E_i^T G_i + P + M\,(w v_y, -w v_x, 0) .
 
 A contact follows within :math:`U / (C g)`, some milliseconds: steps are implicit in V, which is stable at rest, too,
-and without inertia, resistance and slope is :func:`steady_twist`: the balance that is linear in V,
+and without inertia, resistance and slope (:func:`terrain.slip_learning.rollers.steady_twist`) is linear in V,
 
 .. math:: \sum_i n_i \left(D_i^T D_i + \rho\,E_i^T E_i\right) V = \sum_i n_i D_i^T u_i .
 
@@ -841,43 +841,6 @@ def _solve(matrix: Array, pushed: Array, out: Array) -> None:
     out[0] = (p0 * x + p1 * y + p2 * z) * by
     out[1] = (p1 * x + q1 * y + q2 * z) * by
     out[2] = (p2 * x + q2 * y + r2 * z) * by
-
-
-def steady_twist(
-    wheel_speed_mps: Array,
-    positions_m: Array,
-    direction_rad: Array,
-    load_ratio: Array,
-    roller_ratio: float,
-    scale_error: float = 0.0,
-) -> Array:
-    """Return the twist (n, 3) of a body whose wheels turn at steady speeds (n, wheels).
-
-    Parameters
-    ----------
-    wheel_speed_mps : (n, wheels) circumferential
-    positions_m, direction_rad : (wheels, 2) and (wheels,) of the wheels
-    load_ratio : (wheels,) shares of the weight, summing to 1
-    roller_ratio : rho, friction of the rollers over the stiffness of traction; 0 is free
-    scale_error : kappa
-
-    Examples
-    --------
-    A wheel that rolls across entirely, and carries most of the weight, brakes the more:
-
-    >>> from terrain.robots import load_robot
-    >>> place = load_robot("robotino").wheel_positions_m, np.radians([150.0, 270.0, 390.0])
-    >>> ahead, left, _ = 0.1 * rolling_matrix(*place).T
-    >>> load = np.array([0.25, 0.5, 0.25])
-    >>> steady_twist(np.array([ahead, left]), *place, load, 0.8)[:, :2].diagonal().round(4)
-    array([0.0429, 0.0652])
-    """
-    along = rolling_matrix(positions_m, direction_rad)
-    across = rolling_matrix(positions_m, np.asarray(direction_rad) + np.pi / 2)
-    balance = (along * load_ratio[:, None]).T @ along
-    balance = balance + roller_ratio * (across * load_ratio[:, None]).T @ across
-    driven = np.asarray(wheel_speed_mps) @ (along * load_ratio[:, None])
-    return np.asarray((1.0 - scale_error) * np.linalg.solve(balance, driven.T).T)
 
 
 OMNI = PlanarDrive(ROLLERS, _omni_numbers, _move_omni, drifts=False)

@@ -5,9 +5,8 @@ import pytest
 
 from terrain.errors import DataError
 from terrain.kinematics.wheels import rolling_matrix
-from terrain.simulation.plants.planar import steady_twist
 from terrain.slip_learning.measured import measured_slip
-from terrain.slip_learning.rollers import distance_bound, roller_findings, surface_of_windows
+from terrain.slip_learning.rollers import distance_bound, roller_findings, steady_twist, surface_of_windows
 
 LOADS = {"": np.array([0.25, 0.45, 0.30]), "loaded": np.array([0.40, 0.35, 0.25])}
 RATIO = {"cork": 0.05, "moss": 0.6}

@@ -20,10 +20,10 @@ from terrain.simulation.plants.planar import (
     make_planar,
     move,
     spread_numbers,
-    steady_twist,
 )
 from terrain.simulation.run import simulate
 from terrain.slip_learning.measured import measured_slip
+from terrain.slip_learning.rollers import steady_twist
 
 ROBOT = load_robot("robotino")
 PLACE = ROBOT.wheel_positions_m, ROBOT.wheel_directions_rad
