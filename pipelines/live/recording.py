@@ -27,10 +27,10 @@ from pipelines.data.bag_files import McapWriter
 from pipelines.live.chain import CommandStatus, Step
 from pipelines.live.classifying import WindowOutput
 from terrain.control.switching import SWITCHING
-from terrain.logs.replay import TWIST
 from terrain.logs.run_folders import RecordedWindow, RunHead, run_folder
 from terrain.logs.run_topics import LATEST_S, WINDOW_TOPIC, RunRecorder, check_recordable
 from terrain.logs.samples import BAD_TIME
+from terrain.logs.schema import TWIST
 from terrain.records import Array, Reading
 
 FLUSH_S = 1.0

@@ -32,8 +32,8 @@ from terrain.errors import DataError
 from terrain.estimation.feed import MIN_CONFIDENCE_RATIO
 from terrain.identify import Parameter, half_width, identify, std_interval
 from terrain.kinematics.camera import CHANNELS, body_motion
-from terrain.kinematics.wheels import TWIST, point_velocity
-from terrain.logs.schema import IMU_CHANNELS
+from terrain.kinematics.wheels import point_velocity
+from terrain.logs.schema import IMU_CHANNELS, TWIST
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 from terrain.signals import true_stretches

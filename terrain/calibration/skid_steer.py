@@ -31,7 +31,7 @@ from scipy.stats import trim_mean
 
 from terrain.calibration.finding import Finding, around, undetermined
 from terrain.identify import half_width, jackknife
-from terrain.kinematics.wheels import TWIST
+from terrain.logs.schema import TWIST
 from terrain.records import Array, RunLog
 from terrain.signals import peak
 

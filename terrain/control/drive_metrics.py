@@ -30,7 +30,8 @@ from terrain.control.situations import (
 from terrain.control.slip_table import SlipTable
 from terrain.control.switching import DRIVING_MPS, OutputStatus
 from terrain.kinematics.logged_wheels import true_slip
-from terrain.kinematics.wheels import TWIST, wheel_frame_velocities
+from terrain.kinematics.wheels import wheel_frame_velocities
+from terrain.logs.schema import TWIST
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 from terrain.signals import low_pass, true_stretches

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from terrain.kinematics.wheels import TWIST, wheel_frame_velocities
+from terrain.kinematics.wheels import wheel_frame_velocities
+from terrain.logs.schema import TWIST
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 from terrain.slip import traction_slip

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from terrain.kinematics.camera import CHANNELS, QUATERNION_TOLERANCE, to_body, to_camera
 from terrain.logs.mapping import POSITION_CHANNELS, Converted, MessageKind, local_metres
-from terrain.logs.replay import TWIST
-from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS
+from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS, TWIST
 from terrain.records import Array, Stream
 
 UNKNOWN = -1.0

@@ -30,9 +30,6 @@ from numba.extending import register_jitable
 from terrain.errors import ConfigError
 from terrain.records import Array
 
-TWIST = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
-"""Columns of a twist, as channels and states have them."""
-
 MAX_CONDITION = 1e6
 """Of the matrix from twist to wheel speeds, lengths over the size of the robot: beyond, directions agree."""
 

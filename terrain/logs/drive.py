@@ -101,7 +101,6 @@ import numpy as np
 from terrain.angles import arcs
 from terrain.errors import LogError
 from terrain.files.names import normal_name
-from terrain.kinematics.wheels import TWIST
 from terrain.logs.imu_axes import MIN_MOVING_RADPS, POWER_SIGN, current_sign, find_axes, with_sign_of_torque
 from terrain.logs.samples import (
     check_log_file,
@@ -110,7 +109,7 @@ from terrain.logs.samples import (
     rising_rows,
     short_name,
 )
-from terrain.logs.schema import POSE_CHANNELS
+from terrain.logs.schema import POSE_CHANNELS, TWIST
 from terrain.logs.tables import read_groups, row_number, text_rows
 from terrain.records import Array, Label, RunLog
 

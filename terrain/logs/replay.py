@@ -8,13 +8,12 @@ import numpy as np
 
 from terrain.errors import ConfigError, DataError
 from terrain.logs.samples import longest_rise
+from terrain.logs.schema import TWIST
 from terrain.records import Array, Reading, RunLog, Sample
 
 SENSORS: tuple[str, ...] = ("wheels", "steering", "imu", "odometry", "gnss", "compass", "pose")
 """Streams that a robot's sensors write; the others are commands, truth and what was made of them."""
 
-TWIST: tuple[str, ...] = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
-"""Channels of the desired motion in the stream ``commands``."""
 
 MAX_STEPS = 20_000_000  #: Of a replay: 111 hours at 50 Hz
 

@@ -44,7 +44,6 @@ import numpy as np
 from terrain.errors import LogError
 from terrain.files.documents import read_json
 from terrain.files.names import normal_name, shown
-from terrain.logs.replay import TWIST
 from terrain.logs.samples import (
     check_log_file,
     checked_names,
@@ -53,7 +52,7 @@ from terrain.logs.samples import (
     short_name,
     whole_run_label,
 )
-from terrain.logs.schema import POSE_CHANNELS, WHEELS_CHANNELS
+from terrain.logs.schema import POSE_CHANNELS, TWIST, WHEELS_CHANNELS
 from terrain.logs.tables import TextLayout, header_of, read_groups, row_number
 from terrain.records import Array, RunLog
 

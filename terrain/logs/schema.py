@@ -108,7 +108,9 @@ GNSS_CHANNELS = (
 POSE_CHANNELS = ("position_x_m", "position_y_m", "yaw_rad")
 """Of a stream of poses of the body's origin, in a frame that is fixed and right-handed."""
 
-ESTIMATOR_CHANNELS = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
+TWIST = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")  #: Of a stream of twists of the body
+
+ESTIMATOR_CHANNELS = (*TWIST, "accel_x_mps2", "accel_y_mps2")
 """States of a filter that go into windows."""
 
 ESTIMATED = ("estimator", "slip")

@@ -39,7 +39,8 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError
 from terrain.estimation.feed import MeasurementTable, on_clock
 from terrain.kernels import njit
-from terrain.kinematics.wheels import TWIST, wheel_frame_velocities
+from terrain.kinematics.wheels import wheel_frame_velocities
+from terrain.logs.schema import TWIST
 from terrain.records import Array, Label, RunLog, SlipTrack, StateTrack
 from terrain.robots import Robot
 from terrain.signals import true_stretches

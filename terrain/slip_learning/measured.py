@@ -70,14 +70,8 @@ from terrain.kernels import njit
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
 from terrain.kinematics.logged_wheels import speed_columns
-from terrain.kinematics.wheels import (
-    TWIST,
-    no_slip_twist,
-    point_velocity,
-    rolling_matrix,
-    wheel_frame_velocities,
-)
-from terrain.logs.schema import POSE_CHANNELS
+from terrain.kinematics.wheels import no_slip_twist, point_velocity, rolling_matrix, wheel_frame_velocities
+from terrain.logs.schema import POSE_CHANNELS, TWIST
 from terrain.records import Array, RunLog, SlipTrack
 from terrain.robots import Robot, robot_named
 from terrain.signals import Delay, DelayStatus, common_delay

@@ -30,8 +30,7 @@ from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError
 from terrain.files.names import data_folder
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.logs.replay import TWIST
-from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
+from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS, TWIST, WHEELS_CHANNELS
 from terrain.robots import load_robot
 
 from .foreign_bags import refused
