@@ -135,14 +135,8 @@ from terrain.files.names import data_folder
 from terrain.kernels import filled, inner, njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.commands import wheel_motion
-from terrain.kinematics.wheels import (
-    TWIST,
-    point_velocity,
-    rolling_matrix,
-    velocity_matrix,
-    wheel_frame_velocities,
-)
-from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS
+from terrain.kinematics.wheels import point_velocity, rolling_matrix, velocity_matrix, wheel_frame_velocities
+from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS, TWIST
 from terrain.records import Array, Label, Stream
 from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot
 from terrain.simulation import sensors as sensing
