@@ -17,12 +17,13 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dis import get_instructions
 from enum import Enum
 from functools import cache
 from hashlib import sha256
+from operator import attrgetter
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
@@ -35,8 +36,8 @@ from numba.core.dispatcher import Dispatcher
 
 from terrain.records import Array
 
+#: A compiled function that was not loaded for so long is removed when another one is saved.
 UNUSED_S = 60 * 86400.0
-"""A compiled function that was not loaded for so long is removed when another one is saved."""
 
 
 def cache_folder() -> Path:
@@ -67,23 +68,40 @@ def njit(*signatures: Any, **options: Any) -> Any:
     >>> doubled(1.5)
     3.0
     """
+    if not (len(signatures) == 1 and isinstance(signatures[0], FunctionType)):
+        return lambda function: _compiled(function, signatures, options)
+    return _compiled(signatures[0], (), options)
 
-    def compiled(function: Callable[..., Any]) -> Any:
-        kernel = numba.njit(**options)(function)
-        if not isinstance(kernel, Dispatcher):  # NUMBA_DISABLE_JIT
-            return kernel
-        vars(kernel)["_cache"] = _ContentCache(function, options)
-        if signatures:
-            with typeinfer.register_dispatcher(kernel):
-                for signature in signatures:
-                    kernel.compile(signature)
-                kernel.disable_compile()
+
+def inner(function: Callable[..., Any] | None = None, **options: Any) -> Any:
+    """Compile a function that compiled functions call, and nothing else: :func:`njit`, a fifth faster.
+
+    It has no entry for Python, from where its ``py_func`` is called; a call of itself raises a TypeError.
+    """
+    options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return njit(**options) if function is None else _compiled(function, (), options)
+
+
+def _compiled(function: Callable[..., Any], signatures: Sequence[Any], options: dict[str, Any]) -> Any:
+    kernel = numba.njit(**options)(function)
+    if not isinstance(kernel, Dispatcher):  # NUMBA_DISABLE_JIT
         return kernel
+    vars(kernel)["_cache"] = _ContentCache(function, options)
+    if "no_cpython_wrapper" in options:  # numba would call the entry that is not there
 
-    if len(signatures) == 1 and isinstance(signatures[0], FunctionType):
-        function, signatures = signatures[0], ()
-        return compiled(function)
-    return compiled
+        def refuse(*_: Any, **__: Any) -> None:
+            raise TypeError(f"{function.__qualname__} is called by compiled functions only; call its py_func")
+
+        def keep(found: Any) -> None:
+            kernel.overloads[tuple(found.signature.args)] = found
+
+        vars(kernel).update(_compile_for_args=refuse, add_overload=keep)
+    if signatures:
+        with typeinfer.register_dispatcher(kernel):
+            for signature in signatures:
+                kernel.compile(signature)
+            kernel.disable_compile()
+    return kernel
 
 
 def content_digest(function: Callable[..., Any], options: Mapping[str, Any] | None = None) -> str:
@@ -109,16 +127,19 @@ def content_digest(function: Callable[..., Any], options: Mapping[str, Any] | No
             digest.update(f"{value.__module__}.{value.__qualname__}".encode())
             if value.__module__.partition(".")[0] in ("numba", "numpy", "math"):
                 continue
-            cells = [cell.cell_contents for cell in value.__closure__ or ()]
-            defaults = value.__defaults__, tuple((value.__kwdefaults__ or {}).items())
-            waiting += [*defaults, *cells, *_globals_read(value.__code__, value.__globals__, digest)]
+            waiting += [value.__defaults__, tuple((value.__kwdefaults__ or {}).items())]
+            waiting += map(attrgetter("cell_contents"), value.__closure__ or ())
+            waiting += _globals_read(value.__code__, value.__globals__, digest)
         elif isinstance(value, (tuple, list, frozenset)):
             digest.update(f"{type(value).__name__} {len(value)}".encode())
             waiting += value if not isinstance(value, frozenset) else sorted(value, key=repr)
         elif isinstance(value, np.ndarray):
             digest.update(f"{value.dtype.descr} {value.shape}".encode() + value.tobytes())
+        elif isinstance(value, type) and issubclass(value, Enum):
+            digest.update(repr([(member.name, member.value) for member in value]).encode())
         elif isinstance(value, type):
-            digest.update(_type_content(value))
+            fields, defaults = getattr(value, "_fields", ()), getattr(value, "_field_defaults", {})
+            digest.update(f"{value.__module__}.{value.__qualname__} {fields} {defaults}".encode())
         elif isinstance(value, ModuleType):
             digest.update(value.__name__.encode())
         elif isinstance(value, _PLAIN):
@@ -153,7 +174,9 @@ def _globals_read(code: CodeType, names: Mapping[str, Any], digest: Any) -> list
     """Return the values of the globals that code reads, by their names' order, and digest the code itself."""
     digest.update(code.co_code + repr((code.co_names, code.co_varnames)).encode())
     read = []
-    for constant in code.co_consts[1 if _has_docstring(code) else 0 :]:
+    # of lambdas and comprehensions the first constant is no docstring
+    first = code.co_consts[0] if code.co_consts and not code.co_name.startswith("<") else None
+    for constant in code.co_consts[1 if isinstance(first, str) else 0 :]:
         if isinstance(constant, CodeType):
             read += _globals_read(constant, names, digest)
         else:
@@ -173,29 +196,18 @@ def _loaded_names(code: CodeType) -> list[str]:
     return sorted({step.argval for step in get_instructions(code) if step.opname == "LOAD_GLOBAL"})
 
 
-def _has_docstring(code: CodeType) -> bool:
-    named = not code.co_name.startswith(
-        "<"
-    )  # of lambdas and comprehensions the first constant is no docstring
-    return named and bool(code.co_consts) and isinstance(code.co_consts[0], str)
-
-
-def _type_content(value: type) -> bytes:
-    if issubclass(value, Enum):
-        return repr([(member.name, member.value) for member in value]).encode()
-    fields, defaults = getattr(value, "_fields", ()), getattr(value, "_field_defaults", {})
-    return f"{value.__module__}.{value.__qualname__} {fields} {defaults}".encode()
-
-
 class _ContentCache(FunctionCache):
     """Numba's cache of one function, in files named by its content.
 
-    The content is read when it is first needed, as functions that it calls may be defined after it.
+    The content is read when it is first needed, as functions that it calls may be defined after it.  It is the locator
+    of how numba writes a compiled function, which asks it for its folder.
     """
 
     def __init__(self, function: Callable[..., Any], options: Mapping[str, Any]) -> None:
         self._name, self._py_func, self._options = repr(function), function, options
-        self._impl = _Placed(function)
+        self._impl = CompileResultCacheImpl.__new__(CompileResultCacheImpl)
+        code = function.__code__
+        vars(self._impl).update(_lineno=code.co_firstlineno, _py_file=code.co_filename, _locator=self)
         self.enable()
 
     def _load_overload(self, signature: Any, target_context: Any) -> Any:
@@ -217,15 +229,6 @@ class _ContentCache(FunctionCache):
             self._cache_path = str(cache_folder())
             self._cache_file = IndexDataCacheFile(self._cache_path, name, "")
 
-
-class _Placed(CompileResultCacheImpl):
-    """How a compiled function is written; it is its own locator."""
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._lineno = function.__code__.co_firstlineno
-        self._py_file = function.__code__.co_filename
-        self._locator = self
-
     def ensure_cache_path(self) -> None:
         """Make the folder, for this user only, and remove what is used no more, once a process."""
         _make_folder(cache_folder())
@@ -239,30 +242,6 @@ def _make_folder(folder: Path) -> None:
         with suppress(OSError):  # another process may remove it first
             if max(file.stat()[7:9]) < oldest_s:  # read, or written
                 file.unlink()
-
-
-def inner(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Compile a function that compiled functions call, and nothing else: :func:`njit`, a fifth faster.
-
-    It has no entry for Python, from where its ``py_func`` is called; a call of itself raises a TypeError.
-    """
-
-    def compiled(function: Callable[..., Any]) -> Any:
-        kernel = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)(function)
-        if isinstance(kernel, Dispatcher):  # numba would call the entry that is not there
-
-            def refuse(*_: Any, **__: Any) -> None:
-                raise TypeError(
-                    f"{function.__qualname__} is called by compiled functions only; call its py_func"
-                )
-
-            def keep(found: Any) -> None:
-                kernel.overloads[tuple(found.signature.args)] = found
-
-            vars(kernel).update(_compile_for_args=refuse, add_overload=keep)
-        return kernel
-
-    return compiled if function is None else compiled(function)
 
 
 def record(fields: Mapping[str, Any]) -> np.dtype[Any]:
@@ -280,10 +259,11 @@ def record(fields: Mapping[str, Any]) -> np.dtype[Any]:
     >>> filled(robot, np.nan)[0]["wheels"][1]["forces_n"]
     array([nan, nan])
     """
-    pairs = ((name, field if isinstance(field, tuple) else (field, ())) for name, field in fields.items())
-    return np.dtype(
-        [(name, np.uint8 if kind is bool else kind, shape) for name, (kind, shape) in pairs], align=True
-    )
+    members = []
+    for name, field in fields.items():
+        kind, shape = field if isinstance(field, tuple) else (field, ())
+        members.append((name, np.uint8 if kind is bool else kind, shape))
+    return np.dtype(members, align=True)
 
 
 def numbers(names: str) -> dict[str, Any]:
@@ -312,20 +292,15 @@ def filled(fields: np.dtype[Any], value: float = 0.0, **values: Any) -> Array:
     (2.0, 0)
     """
     one = np.zeros(1, fields)
-    if value != 0.0:
-        _fill(one, value)
+    parts = [one] if value != 0.0 else []
+    for part in parts:
+        if part.dtype.names is not None:
+            parts += [part[name] for name in part.dtype.names]
+        elif part.dtype.kind == "f":
+            part[...] = value
     for name, given in values.items():
         one[name] = given
     return one
-
-
-def _fill(array: Array, value: float) -> None:
-    if array.dtype.names is None:
-        if array.dtype.kind == "f":
-            array[...] = value
-        return
-    for name in array.dtype.names:
-        _fill(array[name], value)
 
 
 def is_finite(array: Array) -> bool:

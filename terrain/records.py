@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from operator import attrgetter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -115,7 +116,7 @@ class RunLog:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "streams", MappingProxyType(dict(self.streams)))
-        object.__setattr__(self, "labels", tuple(Label(*label) for label in self.labels))
+        object.__setattr__(self, "labels", tuple(map(Label._make, self.labels)))
         object.__setattr__(self, "dropped", MappingProxyType(dict(self.dropped)))
 
     @property
@@ -131,7 +132,7 @@ class RunLog:
     @property
     def terrains(self) -> tuple[str, ...]:
         """The distinct terrain labels in order of appearance."""
-        return tuple(dict.fromkeys(label.terrain for label in self.labels))
+        return tuple(dict.fromkeys(map(attrgetter("terrain"), self.labels)))
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a column a channel, ``(stream, channel)``, by time in s; NaN where a stream has no sample."""
@@ -173,8 +174,8 @@ class Command(NamedTuple):
     status: Mapping[str, float]  #: figures of the decision, by name ending in a unit; always the same names
 
 
+#: How a filter used a sensor's measurement at one step (:attr:`StateTrack.use`).
 ABSENT, USED, GATED, REOPENED = 0, 1, 2, 3
-"""How a filter used a sensor's measurement at one step (:attr:`StateTrack.use`)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

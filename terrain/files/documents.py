@@ -71,31 +71,26 @@ def check_keys(place: str, entry: Any, desired: list[str], optional: tuple[str, 
     if not isinstance(entry, dict):
         raise ConfigError(f"{place} is {shown(entry)}, a mapping with {', '.join(desired)} is required")
     accepted = [*desired, *optional]
-    unknown = [str(key) for key in entry if key not in accepted]
-    missing = [key for key in desired if key not in entry]
-    if unknown:
-        raise ConfigError(f"{place}: key {shown(unknown[0])} is unknown (accepted: {', '.join(accepted)})")
-    if missing:
-        raise ConfigError(f"{place}: key {missing[0]!r} is missing")
+    for key in entry:
+        if key not in accepted:
+            raise ConfigError(f"{place}: key {shown(str(key))} is unknown (accepted: {', '.join(accepted)})")
+    for key in desired:
+        if key not in entry:
+            raise ConfigError(f"{place}: key {key!r} is missing")
 
 
 MAX_JSON_BYTES = 16 * MEBIBYTE  #: A run with a label each second of 24 hours has 7 MiB of them
-
-MAX_YAML_BYTES = MEBIBYTE
-"""Descriptions are written and read by people: the longest of the package has 20 KiB."""
-
+MAX_YAML_BYTES = (
+    MEBIBYTE  #: Descriptions are written and read by people: the longest of the package has 24 KiB
+)
 MAX_DEPTH = 32  #: Levels of lists and mappings; those of this package have 6 at most
-
-MAX_NODES = 100_000
-"""Values of a YAML file, those of an alias counted each time: reading as many takes some seconds."""
-
+MAX_NODES = 100_000  #: Values of YAML, those of an alias counted each time: so many take some seconds to read
 MAX_PLACE_CHARACTERS = 200  #: Keys down to a fault, as a message names them
 
 _MAX_WHOLE = 2**63
 _DEEP = f"is nested deeper than {MAX_DEPTH} levels"
-
+#: What the constructors of YAML raise on a scalar that does not suit its tag, as the date 2026-13-45
 _BAD_VALUES = (ValueError, LookupError, AttributeError, TypeError, OverflowError)
-"""What the constructors of YAML raise on a scalar that does not suit its tag, as the date 2026-13-45."""
 
 
 def read_json(path: Path, place: str, kind: type[TerrainError], most_bytes: int = MAX_JSON_BYTES) -> Any:
@@ -262,32 +257,29 @@ class _BoundedLoader(yaml.SafeLoader):
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """Compose a node, and count those below it."""
         event: Any = self.peek_event()  # type: ignore[no-untyped-call]
-        if isinstance(event, yaml.AliasEvent):
+        is_alias, before = isinstance(event, yaml.AliasEvent), self._n_nodes
+        if is_alias:
             anchor: Any = event.anchor
             if anchor in self.anchors and anchor not in self._sizes:
                 raise _TooMuchError(f"holds an alias of itself (*{anchor})")
-            self._count(self._sizes.get(anchor, 1))
-            return super().compose_node(parent, index)
-        before = self._n_nodes
-        self._count(1)
+        self._n_nodes += self._sizes.get(event.anchor, 1) if is_alias else 1
+        if self._n_nodes > MAX_NODES:
+            raise _TooMuchError(f"holds more than {MAX_NODES} values, those of aliases counted each time")
         self._depth += 1
-        if self._depth > MAX_DEPTH + 1:  # the value within the deepest list
+        if self._depth > MAX_DEPTH + 1 and not is_alias:  # the value within the deepest list
             raise _TooMuchError(_DEEP)
         node = super().compose_node(parent, index)
         self._depth -= 1
-        if event.anchor is not None:
+        if event.anchor is not None and not is_alias:
             self._sizes[event.anchor] = self._n_nodes - before
         return node
-
-    def _count(self, n_nodes: int) -> None:
-        self._n_nodes += n_nodes
-        if self._n_nodes > MAX_NODES:
-            raise _TooMuchError(f"holds more than {MAX_NODES} values, those of aliases counted each time")
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Construct a mapping whose keys differ."""
         keys: set[str] = set()
-        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                continue
             if key.value in keys:
                 raise yaml.constructor.ConstructorError(
                     None, None, f"key {shown(key.value)} is given twice", key.start_mark

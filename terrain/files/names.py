@@ -17,9 +17,8 @@ from terrain.errors import TerrainError
 
 MEBIBYTE = 2**20
 
+#: Characters of the longest name; file systems take 255 bytes, and writing adds some for a temporary name
 MAX_NAME = 128
-"""Characters of the longest name; file systems take 255 bytes, and writing adds some for a temporary name."""
-
 MAX_NAME_BYTES = 240  #: The same in bytes of UTF-8, of which letters of some scripts have three each
 MAX_LISTED = 20  #: Names that a message lists: files can have thousands of columns
 MAX_SHOWN = 120  #: Characters of a value that a message shows: files can hold values of megabytes

@@ -170,7 +170,7 @@ def soil_from(file: str, described: Any) -> Soil:
         raise ConfigError(f"{file}: name is {name!r}, a word is required")
     if not isinstance(law, str) or law not in LAWS:
         raise ConfigError(f"{file}: law {law!r} is unknown: use one of {', '.join(LAWS)}")
-    sinks = law == "janosi" and any(key in described for key in SINKAGE)
+    sinks = law == "janosi" and not described.keys().isdisjoint(SINKAGE)
     parameters = [*RESISTANCE, "roughness_m3", *LAWS[law], *(SINKAGE if sinks else ())]
     parameters += [ROLLERS] if ROLLERS in described else []
     check_keys(file, described, ["name", "law", *parameters])

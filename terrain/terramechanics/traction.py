@@ -39,6 +39,8 @@ from terrain.kernels import filled, njit, numbers, record
 from terrain.records import Array
 from terrain.terramechanics.soil import Soil
 
+#: A soil under a wheel: whether it is a road, the wheel, and the numbers of :class:`Soil`, with tan(phi) and
+#: k = kc + b kphi.
 GROUND = record(
     numbers(
         "wheel_radius_m tyre_width_m contact_length_m cohesion_pa tan_friction shear_modulus_m "
@@ -47,13 +49,10 @@ GROUND = record(
     )
     | {"hard": bool}
 )
-"""A soil under a wheel: whether it is a road, the wheel, and the numbers of :class:`Soil`, with tan(phi) and
-k = kc + b kphi."""
-
 _SMALL = 0.01  #: Below this s l / K a series is nearer the truth than a difference of nearly equal numbers
 
+#: Steps of slip in which a balance is sought: a reach within the 0.001 beside a peak goes unseen.
 _N_BRACKETS = 1000
-"""Steps of slip in which a balance is sought: a reach within the 0.001 beside a peak goes unseen."""
 
 
 @njit
@@ -226,16 +225,19 @@ def ground_record(soil: Soil, wheel_radius_m: float, tyre_width_m: float, contac
 
     Numbers that the soil does not have are 0; a sinkage modulus of 0 is ground that does not yield.
     """
-    described = {name: getattr(soil, name) for name in GROUND.names or () if hasattr(soil, name)}
-    numbers = described | {
+    known = {
         "wheel_radius_m": wheel_radius_m,
         "tyre_width_m": tyre_width_m,
         "contact_length_m": contact_length_m,
         "tan_friction": math.tan(soil.friction_angle_rad),
         "sinkage_modulus": soil.kc_npmn1 + tyre_width_m * soil.kphi_npmn2,
     }
-    known = {name: value for name, value in numbers.items() if math.isfinite(value)}
-    return filled(GROUND, hard=soil.law == "magic", **known)
+    ground = filled(GROUND, hard=soil.law == "magic")
+    for name in GROUND.names or ():
+        value = known.get(name, getattr(soil, name, math.nan))
+        if math.isfinite(value):
+            ground[name] = value
+    return ground
 
 
 @njit
