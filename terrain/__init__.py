@@ -14,6 +14,7 @@ from typing import Any
 
 __version__ = "0.1.0"
 
+#: The names that ``import terrain`` offers, and what they are.
 FACE = {
     "load_runs": "pipelines.data.datasets.load_runs",
     "Runs": "pipelines.data.runs.Runs",
@@ -28,8 +29,6 @@ FACE = {
     "Observer": "pipelines.live.observer.Observer",
     "replay": "terrain.logs.replay.replay",
 }
-"""The names that ``import terrain`` offers, and what they are."""
-
 __all__ = ["__version__", *FACE]
 
 

@@ -126,7 +126,7 @@ class Inverse(NamedTuple):
     combine: Combine = Combine.ADDED  #: how the corrected number follows from the measured one
     without_home: bool = False  #: only where the description lacks the section of the parameter's home
     drifts: bool = False  #: whether the value grows from 0 with the time since the start, by itself a minute
-    #: of what takes more than one number a sample; two parameters may share one
+    #: of what takes more than one number a sample, in place of a change of columns; two parameters may share one
     undo: Callable[[Block, float], None] | None = None
     act: Callable[[Block, float], None] | None = None
 
@@ -352,11 +352,9 @@ def _undo_steering_backlash(block: Block, half_rad: float) -> None:
         known = np.isfinite(angles)
         for k in np.flatnonzero(known).tolist():
             last_rad = float(angles[k])
-            follower = (
-                last_rad
-                if math.isnan(follower)
-                else min(max(follower, last_rad - half_rad), last_rad + half_rad)
-            )
+            if math.isnan(follower):
+                follower = last_rad
+            follower = min(max(follower, last_rad - half_rad), last_rad + half_rad)
             block.values[k, column] = follower
         block.memory[channel] = last_rad, follower
         block.values[known, column] = wrapped(block.values[known, column])
@@ -364,10 +362,8 @@ def _undo_steering_backlash(block: Block, half_rad: float) -> None:
 
 def _undo_gyro(block: Block, _: float) -> None:
     """Take bias and scale off the gyro, and off the fused yaw, which is assumed to be the integral of both."""
-    bias, scale = (
-        block.robot.effects.get("gyro_bias_radps", 0.0),
-        1.0 + block.robot.effects.get("gyro_scale_ratio", 0.0),
-    )
+    effects = block.robot.effects
+    bias, scale = effects.get("gyro_bias_radps", 0.0), 1.0 + effects.get("gyro_scale_ratio", 0.0)
     if "gyro_z_radps" in block.channels:
         gyro = block.values[:, block.channels.index("gyro_z_radps")]
         gyro -= block.applied.effects.get("gyro_bias_radps", 0.0)  # without a home
@@ -521,13 +517,13 @@ ONE_SIDED: tuple[str, ...] = tuple(name for name, p in PARAMETER.items() if p.on
 DEPRECATED: dict[str, str] = {old: p.name for p in PARAMETER.values() for old in p.deprecated}
 
 
-def effect_named(name: str) -> Effect:
+def effect_named(name: str, drive: str | None = None) -> Effect:
     """Return the effect of a name, an alias or a former name.
 
     Raises
     ------
     ConfigError
-        for an unknown name.
+        for an unknown name, and if it does not apply to robots of a drive.
 
     Examples
     --------
@@ -536,6 +532,8 @@ def effect_named(name: str) -> Effect:
     """
     for effect in LIBRARY:
         if name in (effect.name, *effect.aliases, *effect.deprecated):
+            if drive is not None and drive not in effect.drives:
+                raise ConfigError(f"effect {effect.name} does not apply to a robot with the drive {drive!r}")
             return effect
     raise ConfigError(f"effect {name!r} is unknown: use one of {', '.join(e.name for e in LIBRARY)}")
 
@@ -553,10 +551,7 @@ def chosen_effects(drive: str, names: Collection[str]) -> tuple[Effect, ...]:
     ConfigError
         if one is unknown, or does not apply to robots of a drive.
     """
-    chosen = [effect_named(name) for name in names]
-    for effect in chosen:
-        if drive not in effect.drives:
-            raise ConfigError(f"effect {effect.name} does not apply to a robot with the drive {drive!r}")
+    chosen = [effect_named(name, drive) for name in names]
     return tuple(effect for effect in LIBRARY if effect in chosen)
 
 
@@ -625,23 +620,38 @@ def on_samples(
     >>> change(np.zeros(1), np.array([[3.0]]))[1]
     array([[1.5]])
     """
-    inverses = [(effects.get(name, 0.0), PARAMETER[name].inverse) for name in in_plant(Stage.SENSORS)]
-    acting = [(e, inverse) for e, inverse in inverses if e and inverse and stream in inverse.streams]
+    acting = []
+    for name in in_plant(Stage.SENSORS):
+        e, inverse = effects.get(name, 0.0), PARAMETER[name].inverse
+        if e and inverse and stream in inverse.streams:
+            acting.append((e, inverse))
     acting.sort(key=lambda each: not each[1].is_factor)
 
     def change(time_s: Array, values: Array) -> tuple[Array, Array]:
-        stamps = time_s
-        for e, inverse in acting:
-            if inverse.columns == STAMPS:
-                stamps = inverse.combine.invert(stamps, e)
-            elif inverse.act is not None:
-                inverse.act(Block(stream, channels, time_s, values, 0.0, None, None, {}), e)
-            for i, channel in enumerate(channels):
-                if inverse.columns and channel.startswith(inverse.columns):
-                    values[:, i] = inverse.combine.invert(values[:, i], inverse.size(e, time_s))
-        return stamps, values
+        return changed_samples(Block(stream, channels, time_s, values, 0.0, None, None, {}), acting, True)
 
     return change
+
+
+def changed_samples(
+    block: Block, acting: Iterable[tuple[float, Inverse]], sensed: bool
+) -> tuple[Array, Array]:
+    """Return stamps and values, these in place, as effects in their order make sensors show them, or taken off."""
+    stamps, done = block.time_s, set()
+    for e, inverse in acting:
+        change = inverse.combine.invert if sensed else inverse.combine.apply
+        special = inverse.act if sensed else inverse.undo
+        if inverse.columns == STAMPS:
+            stamps = np.asarray(block.start_s + change(stamps - block.start_s, e))
+        elif special is None:
+            for i, channel in enumerate(block.channels):
+                if inverse.columns and channel.startswith(inverse.columns):
+                    size = inverse.size(e, block.time_s - block.start_s)
+                    block.values[:, i] = change(block.values[:, i], size)
+        elif special not in done:
+            special(block, e)
+            done.add(special)
+    return stamps, block.values
 
 
 def read_effects_of(texts: Iterable[str], drive: str) -> dict[str, float]:
@@ -661,9 +671,7 @@ def read_effects_of(texts: Iterable[str], drive: str) -> dict[str, float]:
     acting: dict[str, float] = {}
     for text in texts:
         name, _, given = text.partition("=")
-        effect = effect_named(name.strip())
-        if drive not in effect.drives:
-            raise ConfigError(f"effect {effect.name} does not apply to a robot with the drive {drive!r}")
+        effect = effect_named(name.strip(), drive)
         try:
             values = [float(part) for part in given.split(",")]
         except ValueError:

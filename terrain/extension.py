@@ -30,6 +30,7 @@ from terrain.effects import (
     SCHEMA,
     STAMPS,
     Block,
+    changed_samples,
     checked_covariance,
     checked_effects,
     parameters_of,
@@ -315,25 +316,12 @@ class Correction:
             if not finite.size:
                 return time_s, values
             self._start_s = float(finite[0])
-        stamps, done = np.asarray(time_s), set()
         own = [(value, inverse) for value, inverse in self._acting if name in inverse.streams]
         if any(inverse.columns != STAMPS for _, inverse in own):
             values = np.array(values, dtype=float)
-        about = stamps, values, self._start_s, self._robot, self._applied, self._memory
-        block = Block(name, channels, *about)
+        about = np.asarray(time_s), values, self._start_s, self._robot, self._applied, self._memory
         with np.errstate(invalid="ignore", over="ignore"):  # samples may be no finite numbers
-            for value, inverse in own:
-                if inverse.columns == STAMPS:
-                    stamps = np.asarray(self._start_s + inverse.combine.apply(stamps - self._start_s, value))
-                elif inverse.undo is None:
-                    for i, channel in enumerate(channels):
-                        if inverse.columns and channel.startswith(inverse.columns):
-                            size = inverse.size(value, time_s - self._start_s)
-                            values[:, i] = inverse.combine.apply(values[:, i], size)
-                elif inverse.undo not in done:
-                    inverse.undo(block, value)
-                    done.add(inverse.undo)
-        return stamps, values
+            return changed_samples(Block(name, channels, *about), own, False)
 
 
 class Origin(StrEnum):
@@ -349,9 +337,8 @@ class Basis(NamedTuple):
 
     section: str  #: of the description; empty for a number of the robot itself
     field: str
-    described: (
-        float  # as it stands; the neutral one of Robot.completed where the description lacks the section
-    )
+    #: as it stands; the neutral one of Robot.completed where the description lacks the section
+    described: float
     extended: float  #: with the parameter's value
     origin: Origin
     written: str  #: what the description calls it: of tracks sprocket_radius_m is the wheel_radius_m

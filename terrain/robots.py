@@ -45,7 +45,7 @@ import numpy as np
 from terrain.effects import read_effects
 from terrain.errors import ConfigError
 from terrain.files.documents import check_keys, is_number, numbers, read_yaml
-from terrain.files.names import check_name, data_folder, packaged, shown
+from terrain.files.names import check_name, described_file, packaged, shown
 from terrain.records import Array, read_only
 
 #: Part of a range's width that a run may go beyond it: its ends are percentiles, which runs of the same kind
@@ -265,16 +265,6 @@ class Sensors:
 Part: TypeAlias = Body | Motors | Steering | Camera | Sensors  #: Any section of a description.
 
 
-class Equipment(NamedTuple):
-    """Every section of a description."""
-
-    body: Body
-    motors: Motors
-    steering: Steering
-    camera: Camera
-    sensors: Sensors
-
-
 #: What each section of a description is read into, by its key in the file.
 KIND_OF_SECTION: Mapping[str, type[Part]] = {
     "body": Body,
@@ -446,11 +436,6 @@ class Robot(ABC):
     def wheel_speeds_mps(self, rows: Array) -> Array:
         """Return wheel circumferential speeds for values (..., wheels) of :attr:`wheel_rows`."""
         return np.asarray(rows * self.wheel_radius_m if self.by_motor else rows)
-
-    @property
-    def equipment(self) -> Equipment:
-        """All sections of the description; ``ConfigError`` where one is missing."""
-        return Equipment(self.body, self.motors, self.steering, self.camera, self.sensors)
 
     @property
     def encoder_lag_s(self) -> float:
@@ -813,15 +798,7 @@ _READ: dict[str, Robot] = {}
 
 def description_file(name_or_path: str | Path) -> Path:
     """Return the file of a robot's description: the path itself, or that of a robot of the package."""
-    path = Path(name_or_path)
-    if path.suffix in (".yaml", ".yml"):
-        return path
-    known = packaged("robots")
-    if str(name_or_path) not in known:
-        raise ConfigError(
-            f"robot {shown(str(name_or_path))} is unknown: give one of {', '.join(known)}, or a .yaml file"
-        )
-    return data_folder("robots") / f"{name_or_path}.yaml"
+    return described_file(name_or_path, "robot", "robots")
 
 
 def robot_named(name: str, given: Robot | None = None) -> Robot:

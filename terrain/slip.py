@@ -22,8 +22,8 @@ import numpy as np
 from terrain.errors import ConfigError
 from terrain.records import Array
 
+#: With wheel speed and ground speed both lower the slip is noise over noise (thesis 7.2.1).
 MIN_SPEED_MPS = 0.05
-"""With wheel speed and ground speed both lower the slip is noise over noise (thesis 7.2.1)."""
 
 
 def slip_ratio(

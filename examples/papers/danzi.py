@@ -457,7 +457,7 @@ PRINTED_ALIGNMENT = Rotation.from_euler("XZ", [-90.0, -90.0], degrees=True)
 
 def camera_frames(trial: Trial) -> Finding:
     """Compare yaw and speed from the stream of the camera with those of the printed equations."""
-    camera = load_robot(ROBOT).equipment.camera
+    camera = load_robot(ROBOT).camera
     nothing, yaw_rad = np.zeros(2), np.radians([0.0, YAW_DEG])
     angles, speed = np.column_stack([nothing, nothing, yaw_rad]), np.array([[SPEED_MPS, 0.0, 0.0]] * 2)
     stream = odometry_stream(np.array([0.0, 1.0]), np.zeros((2, 2)), angles, speed, camera, yaw_0=0.0)
@@ -482,7 +482,7 @@ def camera_frames(trial: Trial) -> Finding:
 
 def dead_band(trial: Trial) -> Finding:
     """Return the variance (2 d)^2 / 12 of a uniform distribution over the dead band +-d."""
-    return Finding({"variance": Numbers((2 * load_robot(ROBOT).equipment.steering.dead_band_rad) ** 2 / 12)})
+    return Finding({"variance": Numbers((2 * load_robot(ROBOT).steering.dead_band_rad) ** 2 / 12)})
 
 
 # -- 6.2: innovations of the thesis' filter -------------------------------------------------------------------------
@@ -587,7 +587,7 @@ def start_transients(trial: Trial) -> Finding:
     between the two, an error of 0.01 m/s is up to 0.2 of slip.
     """
     robot, runs = load_robot(ROBOT), seeded_runs(trial, "tiles", "straight", duration_s=6.0)
-    lag_s = robot.equipment.sensors.encoder_time_constant_s
+    lag_s = robot.sensors.encoder_time_constant_s
     curves = {
         "raw": [_slip_with(run, robot, time_constant_s=0.0) for run in runs],
         "printed": [_slip_with(run, robot, ema_alpha=THESIS_EMA_ALPHA) for run in runs],

@@ -72,7 +72,7 @@ class Event(NamedTuple):
 
 def starts_and_stops(stretch: Stretch, robot: Robot) -> list[Event]:
     """Return the straight starts and stops of a stretch on hard ground."""
-    _, motors, _, _, sensors = robot.equipment
+    motors, sensors = robot.motors, robot.sensors
     wheels = stretch.of("wheels", [f"motor_{i}_radps" for i in robot.wheels])
     angles = stretch.of("steering", [f"angle_{i}_rad" for i in robot.wheels])
     imu = stretch.of("imu", ("accel_x_mps2", "accel_y_mps2"))

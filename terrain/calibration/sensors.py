@@ -80,7 +80,7 @@ def standing(run: RunLog, robot: Robot, min_s: float = MIN_STANDING_S) -> list[S
     The wheels stand, where the log has any; the IMU is there, scatters about its noise, turns by no more
     than a bias can, and is not frozen.  What is returned is short of the motion at either end by a block.
     """
-    _, motors, _, _, sensors = robot.equipment
+    motors, sensors = robot.motors, robot.sensors
     imu = Stretch(run).of("imu", GYRO + ACCEL)
     if imu is None:
         return []
@@ -131,7 +131,7 @@ def gyro_bias(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
     parts = [np.array(part) for part in means.values()]
     found = np.array([part.mean(axis=0) for part in parts])
     variance = np.array([part.var(axis=0, ddof=1) / len(part) for part in parts])
-    described = robot.equipment.sensors.gyro_bias_std_radps
+    described = robot.sensors.gyro_bias_std_radps
     return biases(names, found, variance, described, n, "samples", tuple(means))
 
 
@@ -291,7 +291,7 @@ def accelerometer(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
     n = sum(len(of_run[run_id]) for run_id in runs)
     bias, scale, cov = (np.array(part) for part in zip(*fits.values(), strict=True))
     variance = np.diagonal(cov, axis1=1, axis2=2)
-    described = robot.equipment.sensors.accel_bias_std_mps2
+    described = robot.sensors.accel_bias_std_mps2
     half = half_width(np.sqrt(variance[:, 3:].mean(axis=0) / len(runs)), math.inf)
     scales = zip(scale_names, scale.mean(axis=0), half, strict=True)
     return [
@@ -360,7 +360,7 @@ def sensor_noise(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
 def _noise(parameter: str, residuals: Sequence[Array], n: int, runs: Sequence[str], robot: Robot) -> Finding:
     """Return the finding of one number by the residuals of batches about straight lines."""
     section, _, name = parameter.partition(".")
-    described = getattr(getattr(robot.equipment, section), name)
+    described = getattr(getattr(robot, section), name)
     if not residuals:
         return undetermined([parameter], "no standing stretch has this signal")[0]
     squares = float(sum((part**2).sum() for part in residuals))
@@ -378,7 +378,7 @@ def _noise(parameter: str, residuals: Sequence[Array], n: int, runs: Sequence[st
     low, high = std_interval(variance, dof / (1 + 2 * (correlation**2).sum()))
     step_variance = 0.0
     if parameter == "sensors.steering_std_rad":
-        step = 2 * math.pi / robot.equipment.sensors.steering_steps_ratio
+        step = 2 * math.pi / robot.sensors.steering_steps_ratio
         step_variance = step**2 / 12
         if variance - step_variance < (MIN_NOISE_STEPS * step) ** 2:
             return undetermined([parameter], f"the noise hides below the encoder's step of {step:.2g} rad")[0]
@@ -407,7 +407,7 @@ def measurement_variances(robot: Robot, floor: float = NOISE_FLOOR) -> dict[str,
     >>> variances["camera_speed_x_mps"], round(variances["accel_x_mps2"], 6)
     (1e-05, 0.000135)
     """
-    _, motors, _, camera, sensors = robot.equipment
+    motors, camera, sensors = robot.motors, robot.camera, robot.sensors
     steering = sensors.steering_std_rad**2 + (2 * math.pi / sensors.steering_steps_ratio) ** 2 / 12
     variances = {
         **{f"wheel_{i}_radps": (sensors.motor_std_radps / motors.reduction_ratio) ** 2 for i in robot.wheels},

@@ -94,7 +94,7 @@ def steady_stretches(stretch: Stretch, robot: Robot) -> list[Steady]:
     time_s, (motor, current) = wheels.time_s, np.hsplit(wheels.values, 2)
     twist = at_times(seen.time_s, seen.values, time_s, MAX_GAP_S)
     angle = at_times(steering.time_s, np.unwrap(steering.values, axis=0), time_s, MAX_GAP_S)
-    wheel_speed = motor / robot.equipment.motors.reduction_ratio * robot.wheel_radius_m
+    wheel_speed = motor / robot.motors.reduction_ratio * robot.wheel_radius_m
     known = np.isfinite(twist).all(axis=1) & np.isfinite(angle).all(axis=1)
     centre = np.full((len(time_s), 3, 2), np.nan)
     v_x, v_y, rate = twist[known].T[..., None]
@@ -143,7 +143,7 @@ def why_none(runs: Sequence[RunLog], robot: Robot, hard: Sequence[str]) -> str:
     on_hard = [run for run in runs if hard_stretches(run, hard)]
     if not on_hard:
         return f"no run is labelled with hard ground ({', '.join(hard)})"
-    slow_radps = MIN_SPEED_MPS / robot.wheel_radius_m * robot.equipment.motors.reduction_ratio
+    slow_radps = MIN_SPEED_MPS / robot.wheel_radius_m * robot.motors.reduction_ratio
     channels = [f"motor_{i}_radps" for i in robot.wheels]
     wheels = [stream for run in on_hard if (stream := Stretch(run).of("wheels", channels))]
     if not wheels:
@@ -193,9 +193,9 @@ def steering_zeros(stretches: Sequence[Steady], robot: Robot) -> list[Finding]:
             # of stretches so few each weighs too much to be left out: the scatter is that of all equations
             squares = fit.residual**2 / np.sqrt(1.0 + fit.residual**2)
             std = fit.std[:3] * math.sqrt(squares.sum() / n_spare)
-            step_rad = 2 * math.pi / robot.equipment.sensors.steering_steps_ratio
+            step_rad = 2 * math.pi / robot.sensors.steering_steps_ratio
             half = half_width(std, n_spare, bounded=step_rad / 2)
-            if half.max() <= robot.equipment.steering.dead_band_rad:
+            if half.max() <= robot.steering.dead_band_rad:
                 zero, runs = (
                     np.angle(np.exp(1j * (about + fit.value[:3]))),
                     [each.run_id for each in stretches],
@@ -212,7 +212,7 @@ def steering_zeros(stretches: Sequence[Steady], robot: Robot) -> list[Finding]:
 
 def _balance(stretch: Steady, slip_rad: Array, robot: Robot) -> tuple[Array, Array]:
     """Return two equations (2, 6), (2,) for the zeros, the stiffness and the force of a slope."""
-    body = robot.equipment.body
+    body = robot.body
     arm = robot.wheel_positions_m - np.array([body.com_x_m, body.com_y_m])
     share = 3 * np.linalg.solve(np.vstack([np.ones(3), arm.T]), [1.0, 0.0, 0.0])
     left = stretch.travel[:, ::-1] * [-1.0, 1.0]

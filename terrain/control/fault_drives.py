@@ -146,7 +146,7 @@ def fault_drive(run: RunLog, history: DriveHistory, robot: Robot, scenario: Scen
     """
     control, commands, time_s = run.streams["control"], run.streams["commands"], run.streams["control"].time_s
     step_s = float(history.time_s[1] - history.time_s[0])
-    tau_s = robot.equipment.sensors.encoder_time_constant_s
+    tau_s = robot.sensors.encoder_time_constant_s
     wheel, ground = (
         low_pass(each, step_s, tau_s, at_first=True) for each in (history.wheel_speed_mps, history.ground_mps)
     )

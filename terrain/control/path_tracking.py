@@ -104,7 +104,7 @@ def check_tracking(robot: Robot, settings: TrackSettings = SETTINGS, delay_s: fl
     """
     if not 0.0 <= delay_s <= LONGEST_STEP_S:
         raise ConfigError(f"path tracking: delay_s is {delay_s!r}, 0 to {LONGEST_STEP_S:g} s is required")
-    fastest_mps = robot.wheel_radius_m * robot.equipment.motors.speed_max_radps
+    fastest_mps = robot.wheel_radius_m * robot.motors.speed_max_radps
     speeds_mps = np.geomspace(MOVING_MPS, fastest_mps, N_SPEEDS).tolist()
     for loop, (k, k_i, _, fastest_ps) in _loops(settings).items():
         gains = k, k_i, fastest_ps
@@ -128,7 +128,7 @@ def _loops(settings: TrackSettings) -> dict[str, tuple[float, float, float, floa
 
 def _loop_matrix(robot: Robot, gains: tuple[float, float, float], delay_s: float, speed_mps: float) -> Array:
     """Return the loop from sample to sample: x, f, s, y, the integral, the delayed commands."""
-    body, _, steering, _, sensors = robot.equipment
+    body, steering, sensors = robot.body, robot.steering, robot.sensors
     dt_s = SAMPLE_TIME_S
     n_delayed = max(math.ceil(delay_s / dt_s - 1e-9), 1)
     plant = np.zeros((5, 5))  # the fifth is the command, held

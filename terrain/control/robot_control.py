@@ -124,7 +124,7 @@ def observe_wheels(
     if estimate is None:
         return UNOBSERVED
     motors, stale_s, steer_rad = (
-        robot.equipment.motors,
+        robot.motors,
         estimate_age(estimate, time_s),
         estimate.mean[steer_states],
     )
@@ -310,7 +310,7 @@ class RobotControl:
     ) -> None:
         self._robot, self._settings, self._estimates = robot, settings, bool(states)
         self._radius_m, self._positions_m = robot.wheel_radius_m, np.array(robot.wheel_positions_m)
-        motors, steering = robot.equipment.motors, robot.equipment.steering
+        motors, steering = robot.motors, robot.steering
         self._limits = robot.wheel_radius_m, motors.speed_max_radps, steering.rate_max_radps
         self._traction = settings_of(robot)
         if states:

@@ -74,7 +74,8 @@ def check_stable(robot: Robot, gains: Gains, delay_s: float = DELAY_S) -> float:
     terrain.errors.ConfigError: robot agrimaro: slip control (kp 2, ki 0) with a delay of 0.05 s is
     unstable from 0.05 to 2 m/s; it is stable up to 0.76 times these gains
     """
-    fastest_mps = robot.wheel_radius_m * robot.equipment.motors.speed_max_radps
+    robot.require("body", "motors", "steering", "sensors")
+    fastest_mps = robot.wheel_radius_m * robot.motors.speed_max_radps
     speeds_mps = np.geomspace(LOW_SPEED_MPS, fastest_mps, N_SPEEDS).tolist()
     places = list(product(speeds_mps, SLIPS, SLOPES))
     without, loops = (
@@ -115,7 +116,7 @@ def loop_matrices(
         raise ConfigError(f"delay_s is {delay_s!r}, 0 to {LONGEST_DELAY_S:g} s is required")
     dt_s, radius_m = SAMPLE_TIME_S, robot.wheel_radius_m
     n_delayed = math.ceil(delay_s / dt_s - 1e-9)
-    (body, motors, _, _, sensors), third_kg = robot.equipment, robot.mass_kg / 3
+    body, motors, sensors, third_kg = robot.body, robot.motors, robot.sensors, robot.mass_kg / 3
     rate, speed, contact, torque, q, estimate, measured, command = np.eye(8)  # w, v, k, T, q, e, y, u
     lags_s = motors.torque_time_constant_s, motors.speed_estimate_time_constant_s
     torque_s, estimate_s = (max(lag_s, STEP_S) for lag_s in lags_s)  # as in the simulator

@@ -115,7 +115,7 @@ def settings_of(robot: Robot) -> TractionSettings:
     >>> round(settings_of(load_robot("agrimaro")).charge_mps_per_mps2, 3)
     0.1
     """
-    motors = robot.equipment.motors
+    motors = robot.motors
     torque = robot.mass_kg * robot.wheel_radius_m / len(robot.wheels)
     integral = motors.speed_integral_nmpr
     return SETTINGS._replace(

@@ -48,7 +48,7 @@ class LowLevelKinematics:
 
     def __init__(self, robot: SwerveRobot, steer_rad: Array) -> None:
         self._positions_m = np.array(robot.wheel_positions_m)
-        motors, steering = robot.equipment.motors, robot.equipment.steering
+        motors, steering = robot.motors, robot.steering
         self._limits = robot.wheel_radius_m, motors.speed_max_radps, steering.rate_max_radps
         self.steer_rad = np.array(steer_rad, dtype=np.float64)
 

@@ -19,8 +19,8 @@ from terrain.errors import TerrainError
 
 POLL_S = 0.05
 
+#: How often a folder is made that another process removes; each attempt takes some microseconds.
 ATTEMPTS = 100
-"""How often a folder is made that another process removes; each attempt takes some microseconds."""
 
 
 @contextmanager

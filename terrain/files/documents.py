@@ -80,9 +80,7 @@ def check_keys(place: str, entry: Any, desired: list[str], optional: tuple[str, 
 
 
 MAX_JSON_BYTES = 16 * MEBIBYTE  #: A run with a label each second of 24 hours has 7 MiB of them
-MAX_YAML_BYTES = (
-    MEBIBYTE  #: Descriptions are written and read by people: the longest of the package has 24 KiB
-)
+MAX_YAML_BYTES = MEBIBYTE  #: Descriptions are written by people: the longest of the package has 24 KiB
 MAX_DEPTH = 32  #: Levels of lists and mappings; those of this package have 6 at most
 MAX_NODES = 100_000  #: Values of YAML, those of an alias counted each time: so many take some seconds to read
 MAX_PLACE_CHARACTERS = 200  #: Keys down to a fault, as a message names them

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from terrain.errors import TerrainError
+from terrain.errors import ConfigError, TerrainError
 
 MEBIBYTE = 2**20
 
@@ -149,3 +149,19 @@ def data_folder(kind: str) -> Path:
 def packaged(kind: str) -> tuple[str, ...]:
     """Return the names of the packaged YAML of one kind."""
     return tuple(sorted(file.stem for file in data_folder(kind).glob("*.yaml")))
+
+
+def described_file(name_or_path: str | Path, what: str, *kinds: str) -> Path:
+    """Return a path that ends in ``.yaml`` or ``.yml`` as it is, or the packaged file of a name, of some kinds.
+
+    ``ConfigError``, which says ``what`` is unknown, for any other name.
+    """
+    path, known = Path(name_or_path), list[str]()
+    if path.suffix in (".yaml", ".yml"):
+        return path
+    for kind in kinds:
+        known += packaged(kind)
+        if str(name_or_path) in packaged(kind):
+            return data_folder(kind) / f"{name_or_path}.yaml"
+    names = ", ".join(known)
+    raise ConfigError(f"{what} {shown(str(name_or_path))} is unknown: give one of {names}, or a .yaml file")

@@ -21,9 +21,9 @@ from terrain.angles import unwrapped
 from terrain.records import Array, Stream
 from terrain.robots import Camera
 
+#: Quaternions further from length 1 than this are no rotation; four written digits stay well within.
 QUATERNION_TOLERANCE = 0.01
-"""Quaternions further from length 1 than this are no rotation; four written digits stay well within."""
-
+#: Channels of the stream ``odometry``.
 CHANNELS: tuple[str, ...] = (
     *(f"position_{axis}_m" for axis in "xyz"),
     *(f"quaternion_{axis}_ratio" for axis in "xyzw"),
@@ -31,7 +31,6 @@ CHANNELS: tuple[str, ...] = (
     *(f"rate_{axis}_radps" for axis in "xyz"),
     "confidence_ratio",
 )
-"""Channels of the stream ``odometry``."""
 
 
 class BodyMotion(NamedTuple):

@@ -25,12 +25,9 @@ from terrain.kinematics.wheels import point_velocity, velocity_matrix, wheel_fra
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot
 
-STANDING_MPS = 1e-6
-"""A wheel slower than this is at rest: below, its direction is rounding, no command."""
-
+STANDING_MPS = 1e-6  #: A wheel slower than this is at rest: below, its direction is rounding, no command
+#: A wheel steered further than this from where it should be holds back the drive of all (20 degrees).
 FAR_RAD = 0.35
-"""A wheel steered further than this from where it should be holds back the drive of all (20 degrees)."""
-
 # Signatures that any float array fits, read-only or strided: nothing is compiled in the middle of a drive.
 _ROW = types.Array(types.float64, 1, "A", readonly=True)
 _TABLE = types.Array(types.float64, 2, "A", readonly=True)
@@ -83,7 +80,7 @@ def wheel_motion(robot: Robot, twist: Array, dt_s: float) -> WheelMotion:
         driven = np.column_stack([speed, still, speed * np.tan(steer) / robot.wheelbase_m])
         return WheelMotion(driven, speeds, speeds / radius_m, np.column_stack([steer, still]))
     if robot.steered:
-        _, motors, steering, _, _ = robot.equipment
+        motors, steering = robot.motors, robot.steering
         limits = (motors.speed_max_radps, steering.rate_max_radps, dt_s)
         admitted, wheel_radps, steers = wheel_commands(
             robot.wheel_positions_m, radius_m, *limits, np.asarray(twist, float), np.zeros(len(robot.wheels))

@@ -17,11 +17,9 @@ from terrain.logs.mapping import POSITION_CHANNELS, Converted, MessageKind, loca
 from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS, TWIST
 from terrain.records import Array, Stream
 
-UNKNOWN = -1.0
-"""First number of a covariance of what was not measured."""
-
+UNKNOWN = -1.0  #: First number of a covariance of what was not measured
+#: Channels of a tracking camera but its confidence, for which the message has no place.
 _CAMERA = CHANNELS[:-1]
-"""Channels of a tracking camera but its confidence, for which the message has no place."""
 
 
 def attitude(quaternion: Array) -> Array:
@@ -142,6 +140,7 @@ def _paths(path: str, axes: str = "xyz") -> tuple[str, ...]:
 _TWIST = ("linear.x", "linear.y", "angular.z")
 _POSE = (*_paths("position"), *_paths("orientation", "xyzw"))
 
+#: By type of message, those that become channels of their own, and what they are made of.
 KINDS: Mapping[str, MessageKind] = {
     "sensor_msgs/NavSatFix": MessageKind(
         ("latitude", "longitude", "altitude", "status.status", "position_covariance[0]"), _of_fix
@@ -178,8 +177,7 @@ KINDS: Mapping[str, MessageKind] = {
         tuple(f"pose.pose.{path}" for path in _POSE), _of_pose
     ),
 }
-"""By type of message, those that become channels of their own, and what they are made of."""
-
+#: Topic and type of the standard messages that each stream becomes.
 _TOPICS: Mapping[str, tuple[str, str]] = {
     "imu": ("/imu", "sensor_msgs/Imu"),
     "odometry": ("/odometry", "nav_msgs/Odometry"),
@@ -187,10 +185,8 @@ _TOPICS: Mapping[str, tuple[str, str]] = {
     "estimator": ("/estimate/twist", "geometry_msgs/TwistStamped"),
     "truth": ("/truth/twist", "geometry_msgs/TwistStamped"),
 }
-"""Topic and type of the standard messages that each stream becomes."""
-
+#: Streams that become states of joints: the field of their numbers, and the unit of the channels.
 _JOINTS = {"wheels": ("velocity", "_radps"), "steering": ("position", "_rad")}
-"""Streams that become states of joints: the field of their numbers, and the unit of the channels."""
 
 
 class StandardTopic(NamedTuple):

@@ -30,8 +30,8 @@ from numba.extending import register_jitable
 from terrain.errors import ConfigError
 from terrain.records import Array
 
+#: Of the matrix from twist to wheel speeds, lengths over the size of the robot: beyond, directions agree.
 MAX_CONDITION = 1e6
-"""Of the matrix from twist to wheel speeds, lengths over the size of the robot: beyond, directions agree."""
 
 
 def finite_numbers(name: str, given: Any, size: int, missing: bool = False) -> Array:

@@ -485,7 +485,7 @@ def noise_std(robot: Robot) -> dict[str, Array]:
 
     A rotation by a small angle changes a quaternion's vector part by half of it; the confidence has none.
     """
-    _, _, _, camera, sensors = robot.equipment
+    camera, sensors = robot.camera, robot.sensors
     imu = [sensors.gyro_std_radps] * 3 + [sensors.accel_std_mps2] * 3 + [TILT_NOISE_RAD] * 2
     seen = [camera.position_std_m] * 3 + [camera.yaw_std_rad / 2] * 3 + [0.0]
     seen += [camera.speed_std_mps] * 3 + [camera.yaw_rate_std_radps] * 3 + [0.0]

@@ -290,7 +290,7 @@ def six_positions_log(
     """
     if not 0 < hold_s < math.inf:
         raise ConfigError(f"hold_s is {hold_s!r}, a time above zero is required")
-    sensors = robot.equipment.sensors
+    sensors = robot.sensors
     rng = np.random.default_rng(seed)
     crooked = CROOKED_RAD * rng.standard_normal((len(POSITIONS), 2))
     heading = rng.uniform(-math.pi, math.pi, len(POSITIONS))
@@ -400,7 +400,7 @@ class SlipSweep:
 
     def __init__(self, robot: Robot) -> None:
         self._radius_m = robot.wheel_radius_m
-        self._limit_radps = robot.equipment.motors.speed_max_radps
+        self._limit_radps = robot.motors.speed_max_radps
         inner = np.abs(robot.wheel_positions_m[:, 1]).min()
         self._swept = np.flatnonzero(np.isclose(np.abs(robot.wheel_positions_m[:, 1]), inner))
 

@@ -212,7 +212,7 @@ def wheel_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> Sens
 
     Effects act before the noise.
     """
-    motors, sensors = robot.equipment.motors, robot.equipment.sensors
+    motors, sensors = robot.motors, robot.sensors
     time_s, rows = motion.at(sensors.wheels_rate_hz)
     per_amp_nm = motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
     motor_noise = sensors.motor_std_radps * rng.standard_normal((len(rows), 3))
@@ -315,7 +315,7 @@ def imu_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> tuple[
     row, which has no row before it, the rates of roll and pitch are 0.  Of the robot's effects it applies gyro_scale,
     also to the fused yaw.
     """
-    sensors, height_m, record = robot.equipment.sensors, robot.equipment.body.com_height_m, motion.record
+    sensors, height_m, record = robot.sensors, robot.body.com_height_m, motion.record
     stamps = motion.at(sensors.imu_rate_hz, max(sensors.imu_latency_s, STEP_S))
     scale, bias, noise = draw_imu_errors(
         sensors, len(stamps[0]), rng, robot.effects.get("gyro_scale_ratio", 0.0)
@@ -377,7 +377,7 @@ def camera_sensor(motion: Motion, robot: Robot, rng: np.random.Generator, faults
     Without noise its samples are those of :func:`terrain.kinematics.camera.odometry_stream`; lost samples are left out.
     Effects act on samples with their noise.
     """
-    camera, record = robot.equipment.camera, motion.record
+    camera, record = robot.camera, motion.record
     time_s, rows = motion.at(camera.rate_hz, camera.latency_s)
     n = len(rows)
     yaw_noise = camera.yaw_std_rad * rng.standard_normal(n)

@@ -54,6 +54,11 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.kernels import njit
 from terrain.records import Array
 
+#: Parameters n, c1, c2, l0, l1, tan(phi), K, g, Kp, ns, ab, a, mu_s, L, x, c, whether f is taken (or 1).
+#: Each with where a fit begins, the standard deviation of its prior, and its bounds. Sources of the centres:
+#: n, K and phi, Wong, table 2.3 and chapter 2, sand, and the angle of repose of 29 degrees that the authors
+#: of the trials measured; c1, c2, l0, Ishigami 2007, Wong and Reece 1967; Kp, Ishigami's D1 D2 at 29 degrees
+#: is 11.
 FORCE: dict[str, tuple[float, float, float, float]] = {
     "pressure_exponent": (0.8, 0.3, 0.1, 2.5),
     "peak_ratio": (0.5, 0.2, 0.0, 0.95),
@@ -73,23 +78,15 @@ FORCE: dict[str, tuple[float, float, float, float]] = {
     "cohesion_pa": (0.0, 300.0, 0.0, 5e3),
     "inflow": (1.0, 1.0, 0.0, 1.0),
 }
-"""Parameters n, c1, c2, l0, l1, tan(phi), K, g, Kp, ns, ab, a, mu_s, L, x, c, whether f is taken (or 1).
-
-Each with where a fit begins, the standard deviation of its prior, and its bounds.  Sources of the centres: n,
-K and phi, Wong, table 2.3 and chapter 2, sand, and the angle of repose of 29 degrees that the authors of the
-trials measured; c1, c2, l0, Ishigami 2007, Wong and Reece 1967; Kp, Ishigami's D1 D2 at 29 degrees is 11."""
-
 NAMES = tuple(FORCE)
+#: Of the dry sand, by the density that the authors of the trials measured.
 UNIT_WEIGHT_NPM3 = 1330.0 * GRAVITY_MPS2
-"""Of the dry sand, by the density that the authors of the trials measured."""
-
 INFLOW_EXPONENT = 0.2
 _N_ARC, _N_SIDE = 40, 20
+#: Circumferential speed over that of travel below which a wheel shears as one that stands still.
 _SLOWEST = 1e-2
-"""Circumferential speed over that of travel below which a wheel shears as one that stands still."""
-
+#: Part of the load that the arc carries at least; and its least push up, over that of its pressure alone.
 _LEAST = 0.1
-"""Part of the load that the arc carries at least; and its least push up, over that of its pressure alone."""
 
 
 def bulldozing_ratio(tan_friction: float) -> float:

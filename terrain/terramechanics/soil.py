@@ -28,7 +28,7 @@ import numpy as np
 
 from terrain.errors import ConfigError
 from terrain.files.documents import check_keys, number, read_yaml
-from terrain.files.names import data_folder, packaged
+from terrain.files.names import described_file, packaged
 
 #: The numbers of each traction law.
 LAWS: dict[str, tuple[str, ...]] = {
@@ -146,13 +146,7 @@ def load_soil(name_or_path: str | Path) -> Soil:
     >>> soil.law, soil.cohesion_pa
     ('janosi', 4140.0)
     """
-    path = Path(name_or_path)
-    if path.suffix not in (".yaml", ".yml"):
-        name, extra = str(name_or_path), extra_soil_names()
-        if name not in (known := (*soil_names(), *extra)):
-            names = ", ".join(known)
-            raise ConfigError(f"soil {name!r} is unknown: give one of {names}, or a .yaml file")
-        path = data_folder("soils/extra" if name in extra else "soils") / f"{name}.yaml"
+    path = described_file(name_or_path, "soil", "soils", "soils/extra")
     return soil_from(path.name, read_yaml(path))
 
 

@@ -26,6 +26,9 @@ import numpy as np
 from terrain.records import Array
 from terrain.terramechanics.traction import rigid_wheel_sinkage, slip_sinkage_factor
 
+#: Parameters h0, a, d, e, H, t_s, t_r and m: where a fit begins, and the standard deviation of its prior.
+#: A wheel that is dragged along its axle sinks until its axle is at the surface: from there on its side face
+#: does not grow with depth. The others are factors and exponents of the order of 1, and depths of some mm.
 TRAVEL: dict[str, tuple[float, float]] = {
     "rolling_m": (0.0144, 0.0072),
     "slip_ratio": (0.9, 0.9),
@@ -36,11 +39,6 @@ TRAVEL: dict[str, tuple[float, float]] = {
     "rolling_spin_m": (0.003, 0.003),
     "angle_exponent": (0.6, 0.3),
 }
-"""Parameters h0, a, d, e, H, t_s, t_r and m: where a fit begins, and the standard deviation of its prior.
-
-A wheel that is dragged along its axle sinks until its axle is at the surface: from there on its side face
-does not grow with depth.  The others are factors and exponents of the order of 1, and depths of some mm."""
-
 LYASKO: dict[str, tuple[float, float]] = {"rolling_m": (0.0144, 0.0072), "slip_exponent": (1.0, 1.0)}
 DING: dict[str, tuple[float, float]] = {"pressure_kpa": (50.0, 50.0), "exponent_slip": (0.5, 0.5)}
 

@@ -183,7 +183,7 @@ def draw_profile(
             raise ConfigError(f"scenario {scenario.name}: terrain {patch.terrain!r} has no soil")
     used = [soils[patch.terrain] for patch in scenario.patches]
     start_m = np.array([patch.start_m for patch in scenario.patches])
-    speed_max_radps = robot.equipment.motors.speed_max_radps
+    speed_max_radps = robot.motors.speed_max_radps
     farthest_m = 2.0 * robot.wheel_radius_m * speed_max_radps * scenario.time_s[-1]
     n_cells = math.ceil(farthest_m / FIELD_STEP_M) + 1
     if n_cells > MAX_FIELD_CELLS:
@@ -207,7 +207,7 @@ def patches_on(
     robot: Robot, soils: Sequence[Soil], roughness_m3: Sequence[float], start_m: Sequence[float] | Array
 ) -> Array:
     """Return soils under the wheels of a robot, with their roughness and starts, (soils,) of :data:`PATCH`."""
-    body, patches = robot.equipment.body, np.zeros(len(soils), PATCH)
+    body, patches = robot.body, np.zeros(len(soils), PATCH)
     wheel = robot.wheel_radius_m, body.tyre_width_m, body.contact_length_m
     for patch, soil in zip(patches, soils, strict=True):
         (patch["ground"],) = ground_record(soil, *wheel)
@@ -223,7 +223,7 @@ def make_plant(robot: Robot, conditions: Conditions) -> Array:
     ConfigError
         if the load takes the centre of mass out of the triangle of the wheels.
     """
-    body, motors, steering, _, sensors = robot.equipment
+    body, motors, steering, sensors = robot.body, robot.motors, robot.steering, robot.sensors
     parts = (steering, body, motors, sensors, conditions)  # a torque is that of the motors
     described = {n: getattr(part, n) for part in parts for n in PLANT.names or () if hasattr(part, n)}
     effects = dict.fromkeys(parameters_of(robot.drive), 0.0) | dict(robot.effects)
@@ -647,7 +647,7 @@ def run_dynamic(
         raise ConfigError(
             f"scenario {scenario.name}: rate_hz is {scenario.rate_hz:g}, it must divide {1 / STEP_S:g}"
         )
-    on_board = {"camera": robot.equipment.camera, "sensors": robot.sensors}
+    on_board = {"camera": robot.camera, "sensors": robot.sensors}
     for section, part in on_board.items():
         for name in ("rate_hz", "wheels_rate_hz", "steering_rate_hz", "imu_rate_hz"):
             if getattr(part, name, 0.0) > 1 / STEP_S:

@@ -137,7 +137,7 @@ def test_a_frame_that_is_not_used_says_why():
 
 def test_resolutions_are_far_below_the_noise_and_ranges_cover_the_robot():
     """Rounding adds less than 3 % to a sensor's variance; rates and speeds cover the limits of the robot."""
-    sensors, camera = ROBOT.equipment.sensors, ROBOT.equipment.camera
+    sensors, camera = ROBOT.sensors, ROBOT.camera
     imu = (sensors.gyro_std_radps, sensors.accel_std_mps2, sensors.tilt_std_rad, sensors.yaw_std_rad)
     seen = (camera.position_std_m, camera.yaw_std_rad / 2, camera.speed_std_mps, camera.yaw_rate_std_radps)
     noise = {
@@ -148,7 +148,7 @@ def test_resolutions_are_far_below_the_noise_and_ranges_cover_the_robot():
     }
     for stream, column, std in ((name, *each) for name, rows in noise.items() for each in rows):
         assert bounds(stream, column)[2] ** 2 / 12 < 0.03 * std**2, (stream, column)
-    motors = ROBOT.equipment.motors
+    motors = ROBOT.motors
     assert bounds("wheels", 0)[1] > 2 * motors.reduction_ratio * motors.speed_max_radps
     assert bounds("corrections", 0)[1] > 1.5 * motors.speed_max_radps
     for stream, column in (("steering", 0), ("imu", 6), ("imu", 8)):

@@ -179,7 +179,6 @@ from terrain.discrepancy.runs import Simulation
 from terrain.discrepancy.verdict import Limit, Value
 from terrain.extension import Correction, corrected
 from terrain.robots import load_robot
-from terrain.simulation.plants.dynamic import built_with
 
 robot, name = load_robot("agrimaro"), "gear_wear_ratio"
 for table in (effects.BOUNDS, effects.STEPS, effects.NUISANCES, effects.SENSED_ONLY, effects.ONE_SIDED,
@@ -191,9 +190,9 @@ assert effects.read_effects_of(["worn=0.05"], "swerve") == {name: 0.05}
 assert Simulation(robot, effects={name: 0.05}, scatter={name: 0.1}).library[-2].name == "gear_wear"
 entry = {"value": 0.05, "unit": "ratio", "source": "test"}
 assert effects.read_effects("here", {"schema": 1, "worn_ratio": entry}, "swerve")[0] == {name: 0.05}
-for extended in (corrected(replace(robot, effects={name: 0.05})), built_with(robot, {name: 0.05})):
-    assert extended.motors.efficiency_ratio == robot.motors.efficiency_ratio * 1.05
-    assert not extended.effects
+extended = corrected(replace(robot, effects={name: 0.05}))
+assert extended.motors.efficiency_ratio == robot.motors.efficiency_ratio * 1.05 and not extended.effects
+assert name in effects.in_plant(effects.Stage.DESCRIPTION)
 assert quantity(name, 0.05) == "5\N{NO-BREAK SPACE}%"
 assert limit_text(Limit(name, 0.05, "ratio", "z"), False).startswith("A gear wear off by under 5")
 ticking = replace(robot, effects={"ticks_ratio": 0.1})

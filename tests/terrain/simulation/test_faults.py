@@ -219,7 +219,7 @@ def test_a_stream_that_freezes_before_its_first_sample_repeats_that_one():
 
 def test_the_camera_steps_and_freezes_its_forward_speed_at_any_heading_and_turns_about_the_vertical():
     """As the robot's motion shows in it, by :mod:`terrain.kinematics.camera`."""
-    camera = ROBOT.equipment.camera
+    camera = ROBOT.camera
     before = [sample for sample in samples() if sample.time_s < START_S][-1].readings["odometry"]
     last_mps = body_motion(Stream(*before, CAMERA_CHANNELS), camera).speed_mps[-1, 0]
     for name in ("step_camera_speed", "step_camera_speed_down", "freeze_camera_speed", "step_camera_yaw"):

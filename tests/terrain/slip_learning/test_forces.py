@@ -36,7 +36,7 @@ def forces_of(run):
 def true_wheels(run, forces, pattern):
     truth = run.streams["truth"]
     rows = {str(i): truth.channel(pattern.format(i)) for i in (1, 2, 3)}
-    lag_s = ROBOT.equipment.sensors.encoder_time_constant_s
+    lag_s = ROBOT.sensors.encoder_time_constant_s
     return np.column_stack(list(on_clock(forces.time_s, truth.time_s, rows, lag_s).values()))
 
 
@@ -61,7 +61,7 @@ def test_thrust_load_and_slip_of_a_run_are_near_the_truth(starts):
 def test_samples_lie_on_the_curve_of_the_soil(starts):
     run, forces = starts
     samples = traction_samples(forces, ROBOT.mass_kg, forces.on_terrain(run.labels, "grass"), 0.008)
-    body = ROBOT.equipment.body
+    body = ROBOT.body
     load_n = ROBOT.mass_kg * GRAVITY_MPS2 / 3
     geometry = ROBOT.wheel_radius_m, body.tyre_width_m, body.contact_length_m
     soil = load_soil("grass")
