@@ -24,7 +24,7 @@ from terrain.angles import wrapped
 from terrain.errors import DataError
 from terrain.estimation.filter import DEFAULT_SETTINGS, FilterModel
 from terrain.kinematics.logged_wheels import true_slip, wheel_and_ground_speed
-from terrain.records import GATED, USED, Array, RunLog, StateTrack, Stream
+from terrain.records import GATED, USED, Array, RunLog, StateTrack
 from terrain.robots import Robot
 from terrain.signals import low_passed
 from terrain.slip import slip_ratio
@@ -69,41 +69,41 @@ def consistency_report(track: StateTrack, truth: Array | None = None) -> dict[st
         gated_fraction = gated / max(int(used.sum()) + gated, 1)
         sensors.append(_judge(name, track.nis[used, k], track.nis_dof[used, k], gated_fraction))
     if truth is not None:
-        values = _fitting(truth, track, track.states)
-        known = [state for j, state in enumerate(track.states) if np.isfinite(values[:, j]).any()]
         groups: dict[str, list[str]] = {}
+        known = np.array(track.states)[np.isfinite(_fitting(truth, track)).any(axis=0)].tolist()
         for state in known:  # without axis, number and unit
             groups.setdefault(re.sub(r"(_[xyz\d])?_[a-z0-9]+$", "", state), []).append(state)
         if len(groups) > 1:
             groups["all"] = known
         for name, members in groups.items():
-            squares = nees(track, values[:, [track.states.index(state) for state in members]], members)
+            squares = nees(track, truth, members)
             squares = squares[np.isfinite(squares)]
             states.append(_judge(name, squares, np.full(squares.size, len(members)), 0.0))
     return {"sensors": tuple(sensors), "states": tuple(states)}
 
 
 def nees(track: StateTrack, truth: Array, states: Sequence[str] | None = None) -> Array:
-    """Return the squared error of each instant over its covariance (n,); NaN where the truth (n, d) is.
+    """Return the squared error over its covariance (n,) of all states, or some; NaN where their truth (n, d) is.
 
-    Errors of angles (states in ``rad``) are wrapped.  ``DataError`` where the shape does not fit, or there is no such
-    state.
+    Errors of angles (states in ``rad``) are wrapped.  The truth is of all states; ``DataError`` where its shape does not
+    fit, or there is no such state.
     """
     states = track.states if states is None else tuple(states)
-    for unknown in (state for state in states if state not in track.states):
-        raise DataError(f"the track has no state {unknown!r}: it has {', '.join(track.states)}")
-    index = [track.states.index(state) for state in states]
-    error = track.mean[:, index] - _fitting(truth, track, states)
-    angles = [i for i, state in enumerate(states) if state.endswith("_rad")]
-    error[:, angles] = wrapped(error[:, angles])
+    for state in states:
+        if state not in track.states:
+            raise DataError(f"the track has no state {state!r}: it has {', '.join(track.states)}")
+    index = list(map(track.states.index, states))
+    error = (track.mean - _fitting(truth, track))[:, index]
+    is_angle = np.char.endswith(states, "_rad")
+    error[:, is_angle] = wrapped(error[:, is_angle])
     solved = np.linalg.solve(track.cov[:, index][:, :, index], error[..., None])[..., 0]
     return np.asarray(np.einsum("ni,ni->n", error, solved))
 
 
-def _fitting(truth: Array, track: StateTrack, states: Sequence[str]) -> Array:
+def _fitting(truth: Array, track: StateTrack) -> Array:
     values = np.asarray(truth, dtype=np.float64)
-    if values.shape != (track.time_s.size, len(states)):
-        raise DataError(f"truth has shape {values.shape}, {(track.time_s.size, len(states))} is needed")
+    if values.shape != track.mean.shape:
+        raise DataError(f"truth has shape {values.shape}, {track.mean.shape} is needed")
     return values
 
 
@@ -125,7 +125,7 @@ def _judge(name: str, squares: Array, dof: Array, gated_fraction: float) -> Cons
         end = int(negative[0]) if negative.size else n
         n_independent = float(n / max(1.0, 1 + 2 * rho[1:end].sum()))
     total, mean = n_independent * dof.mean(), float(squares.sum() / dof.sum())
-    low, high = (float(chdtri(total, p)) / total for p in (1 - OUTSIDE / 2, OUTSIDE / 2))
+    low, high = chdtri(total, [1 - OUTSIDE / 2, OUTSIDE / 2]) / total
     verdict = ConsistencyVerdict.CONSERVATIVE if mean < low else ConsistencyVerdict.CONSISTENT
     if mean > high or gated_fraction > MOST_GATED:
         verdict = ConsistencyVerdict.OVERCONFIDENT
@@ -165,7 +165,7 @@ def innovations(
     is_angle = np.isin(model.rows, model.angle_rows)
     value[:, is_angle] = wrapped(value[:, is_angle])
     std[np.isnan(value)] = np.nan
-    return {row: (value[:, i], std[:, i]) for i, row in enumerate(model.rows)}
+    return dict(zip(model.rows, zip(value.T, std.T, strict=True), strict=True))
 
 
 def true_states(
@@ -186,30 +186,28 @@ def true_states(
         return None
     true = np.full(track.mean.shape, np.nan)
     for j, state in enumerate(track.states):
-        values = _true_state(truth, state, robot, initial_yaw_rad)
-        if values is not None and (known := np.isfinite(values)).any():
+        if state == "yaw_rad":
+            yaw = np.unwrap(truth.channel("yaw_rad"))
+            values = yaw - yaw[0] + initial_yaw_rad
+        elif state in truth.channels:
+            values = truth.channel(state)
+        elif state in ("gyro_bias_radps", "imu_yaw_offset_rad") and "gyro_bias_z_radps" in truth.channels:
+            values = truth.channel("gyro_bias_z_radps") - robot.completed.sensors.gyro_bias_z_radps
+            if state == "imu_yaw_offset_rad":
+                values = cumulative_trapezoid(values, truth.time_s, initial=0.0)
+        elif state.startswith("slip_speed_"):
+            wheel = state.split("_")[2]
+            if wheel not in robot.wheels:
+                raise DataError(f"state {state!r} is of a wheel that robot {robot.name} does not have")
+            wheel_speed, along = wheel_and_ground_speed(truth, robot)
+            values = (wheel_speed - along)[:, robot.wheels.index(wheel)]
+        else:
+            continue
+        if (known := np.isfinite(values)).any():
             time_s = truth.time_s[known]
             smooth = low_passed(time_s, values[known], time_constant_s, LONGEST_STEP_S)
             true[:, j] = np.interp(track.time_s, time_s, smooth, left=np.nan, right=np.nan)
     return true
-
-
-def _true_state(truth: Stream, state: str, robot: Robot, initial_yaw_rad: float) -> Array | None:
-    if state == "yaw_rad":
-        yaw = np.unwrap(truth.channel("yaw_rad"))
-        return np.asarray(yaw - yaw[0] + initial_yaw_rad)
-    if state in truth.channels:
-        return truth.channel(state)
-    if state in ("gyro_bias_radps", "imu_yaw_offset_rad") and "gyro_bias_z_radps" in truth.channels:
-        bias = truth.channel("gyro_bias_z_radps") - robot.completed.sensors.gyro_bias_z_radps
-        return np.asarray(bias if "bias" in state else cumulative_trapezoid(bias, truth.time_s, initial=0.0))
-    if state.startswith("slip_speed_"):
-        wheel = state.split("_")[2]
-        if wheel not in robot.wheels:
-            raise DataError(f"state {state!r} is of a wheel that robot {robot.name} does not have")
-        wheel_speed, along = wheel_and_ground_speed(truth, robot)
-        return np.asarray((wheel_speed - along)[:, robot.wheels.index(wheel)])
-    return None
 
 
 def lagged_slip(run: RunLog, robot: Robot) -> tuple[Array, Array]:
@@ -219,12 +217,10 @@ def lagged_slip(run: RunLog, robot: Robot) -> tuple[Array, Array]:
     estimated.
     """
     truth = run.streams["truth"]
-
-    def behind(speeds: Array) -> Array:
-        wheels = (low_passed(truth.time_s, wheel, robot.encoder_lag_s, LONGEST_STEP_S) for wheel in speeds.T)
-        return np.column_stack(list(wheels))
-
-    wheel_speed, ground = map(behind, wheel_and_ground_speed(truth, robot))
+    wheel_speed, ground = wheel_and_ground_speed(truth, robot)
+    for speeds in (wheel_speed, ground):
+        for wheel in speeds.T:
+            wheel[:] = low_passed(truth.time_s, wheel.copy(), robot.encoder_lag_s, LONGEST_STEP_S)
     return slip_ratio(wheel_speed, ground), ground
 
 

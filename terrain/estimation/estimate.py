@@ -264,9 +264,8 @@ def summarize(estimate: Estimate) -> EstimateSummary:
     steps_s = np.diff(track.time_s, append=track.time_s[-1:])
     mean_nees = speed_rmse_mps = math.nan
     if truth is not None:
-        judged = [k for k, state in enumerate(track.states) if state.startswith(JUDGED_STATES)]
-        names = np.array(track.states)[judged].tolist()
-        mean_nees = known_mean(nees(track, truth[:, judged], names)) / len(names)
+        judged = [state for state in track.states if state.startswith(JUDGED_STATES)]
+        mean_nees = known_mean(nees(track, truth, judged)) / len(judged)
         speeds = np.isin(track.states, ("speed_x_mps", "speed_y_mps"))
         speed_rmse_mps = math.sqrt(known_mean((track.mean - truth)[:, speeds] ** 2) * speeds.sum())
     nis: dict[str, float] = {}

@@ -157,7 +157,7 @@ class Signal(NamedTuple):
 
 CAMERA_ROWS = ("camera_speed_x_mps", "camera_speed_y_mps", "camera_yaw_rate_radps", "camera_yaw_rad")
 GNSS_ROWS = ("gnss_position_x_m", "gnss_position_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps")
-_WHEEL_ROWS = tuple(f"wheel_{i}_radps" for i in (1, 2, 3))
+_WHEEL_ROWS = ("wheel_1_radps", "wheel_2_radps", "wheel_3_radps")
 #: All signals, stream by stream, each a row but for roll and pitch, of which jumps are seen only. Half a g of speed,
 #: two thirds of a turn, twice the fastest steering; an accelerometer on rough terrain sees several g; roll and pitch
 #: turn by 3 rad/s at the most, and a jump tilts gravity.
@@ -165,7 +165,7 @@ SIGNALS: dict[str, Signal] = {
     **dict.fromkeys(("accel_x_mps2", "accel_y_mps2"), Signal("imu", 20.0, 1000.0)),
     "gyro_z_radps": Signal("imu", 0.5, 20.0),
     "imu_yaw_rad": Signal("imu", 0.1, 4.0),
-    **dict.fromkeys((f"steer_{i}_rad" for i in (1, 2, 3)), Signal("steering", 0.1, 5.0)),
+    **dict.fromkeys(("steer_1_rad", "steer_2_rad", "steer_3_rad"), Signal("steering", 0.1, 5.0)),
     **dict.fromkeys(CAMERA_ROWS[:2], Signal("odometry", 0.1, 5.0, LATCHED)),
     "camera_yaw_rate_radps": Signal("odometry", 0.2, 20.0),
     "camera_yaw_rad": Signal("odometry", 0.1, 4.0, SUBTRACTED),
@@ -174,8 +174,8 @@ SIGNALS: dict[str, Signal] = {
 }
 DERIVED_ROWS = (
     "vibration_mps2",
-    *(f"wheel_{i}_growth_per_s" for i in (1, 2, 3)),
-    *(f"wheel_{i}_change_m2ps3" for i in (1, 2, 3)),
+    *("wheel_1_growth_per_s", "wheel_2_growth_per_s", "wheel_3_growth_per_s"),
+    *("wheel_1_change_m2ps3", "wheel_2_change_m2ps3", "wheel_3_change_m2ps3"),
     *("camera_age_s", "rest_speed_x_mps", "rest_speed_y_mps", "rest_yaw_rate_radps"),
 )
 SIDE_ROWS = ("wheel_left_mps", "wheel_right_mps")

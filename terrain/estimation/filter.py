@@ -23,8 +23,11 @@ Source: the form of the step follows the textbook of Sarkka, Bayesian Filtering 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import chain
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,7 +92,7 @@ class FilterModel:
     process_variance: Array
     measurement_variance: Array
     initial_variance: Array
-    initial_mean: Array = field(default_factory=lambda: np.zeros(0))  #: (d,) zeros without
+    initial_mean: Any = ()  #: (d,) zeros without
     #: names of what is known of each step beside the state; 0 where it is not given
     inputs: tuple[str, ...] = ()
     references: tuple[str, ...] = ()  #: sensors of the speed over ground
@@ -110,7 +113,7 @@ class FilterModel:
         for what, names in (("states", self.states), ("rows", self.rows), ("sensors", self.sensor_names)):
             if len(set(names)) < len(names) or len(names) > MOST:
                 raise ConfigError(f"{place}: {what} {list(names)} have one twice, or are more than {MOST}")
-        grouped = [row for _, rows in self.sensors for row in rows]
+        grouped = list(chain.from_iterable(map(itemgetter(1), self.sensors)))
         if sorted(grouped) != sorted(self.rows):
             raise ConfigError(f"{place}: its sensors must hold every row once; they hold {grouped}")
         for what, known in (
@@ -155,7 +158,7 @@ class FilterModel:
     @property
     def sensor_names(self) -> tuple[str, ...]:
         """Name of each sensor."""
-        return tuple(name for name, _ in self.sensors)
+        return tuple(map(itemgetter(0), self.sensors))
 
 
 class FilterSettings(NamedTuple):
@@ -578,9 +581,9 @@ class Filter:
     """
 
     def __init__(self, model: FilterModel, settings: FilterSettings = DEFAULT_SETTINGS) -> None:
-        sizes = d, m, k, n_inputs = tuple(
-            len(names) for names in (model.states, model.rows, model.sensors, model.inputs)
-        )
+        sizes = d, m, k, n_inputs = tuple(map(len, (model.states, model.rows, model.sensors, model.inputs)))
+        grouped = list(map(itemgetter(1), model.sensors))
+        n_rows = list(map(len, grouped))  # of each sensor
         fixed = filled(
             MODEL,
             **dict(zip(("n_states", "n_rows", "n_sensors", "n_inputs"), sizes, strict=True)),
@@ -589,8 +592,8 @@ class Filter:
             thresholds=np.inf,
         )
         one = fixed[0]
-        one["order"][:m] = [model.rows.index(row) for _, rows in model.sensors for row in rows]
-        one["starts"][: k + 1] = np.cumsum([0, *(len(rows) for _, rows in model.sensors)])
+        one["order"][:m] = list(map(model.rows.index, chain.from_iterable(grouped)))
+        one["starts"][: k + 1] = np.cumsum([0, *n_rows])
         for name, names, chosen in (
             ("is_reference", model.sensor_names, model.references),
             ("is_held", model.sensor_names, model.held),
@@ -601,7 +604,7 @@ class Filter:
             one[name][: len(names)] = np.isin(names, chosen)
         one["x0"][:d] = model.initial_mean
         one["p0"][:d, :d], one["q"][:d, :d] = model.initial_variance, model.process_variance
-        dof = np.arange(1.0, 1 + max(len(rows) for _, rows in model.sensors))
+        dof = np.arange(1.0, 1 + max(n_rows))
         one["thresholds"][1 : 1 + dof.size] = chdtri(dof, 1 - settings.gate_probability)
         self.model, self._max_gap_s = model, settings.max_gap_s + _SLACK_S
         self.state = filled(
@@ -611,11 +614,10 @@ class Filter:
         self.use = self.state["use"][0, :k]
         self.mean[:], self.cov[:] = model.initial_mean, model.initial_variance
         params = np.append(model.params, np.zeros(n_inputs))
-        functions = (  # compiled with their signature: finding them costs more than a step
-            CompileResultWAP(getattr(model, name).overloads[tuple(signature.args)])
-            for name, signature in _SIGNATURES.items()
-        )
-        self._kernel = (fixed, self.state, filled(_WORK), params, *functions)
+        self._kernel: tuple[Any, ...] = fixed, self.state, filled(_WORK), params
+        for name, signature in _SIGNATURES.items():  # compiled with it: finding them costs more than a step
+            function = getattr(model, name).overloads[tuple(signature.args)]
+            self._kernel += (CompileResultWAP(function),)
         self._sample = _Samples(np.empty(1), *(np.zeros((1, size)) for size in (m, m, d, n_inputs)))
         self._nothing = self._columns(1, keep=False)
         self._compiled: Callable[..., None] | None = None
@@ -722,12 +724,14 @@ class Filter:
     def dropped(self) -> dict[str, int]:
         """What was not taken so far, as counts by kind."""
         state = self.state[0]
-        kinds = {"time did not advance": "not_advanced", "clock jump": "jumps", "state numerical": "lost"}
-        counts = {kind: int(state[name]) for kind, name in kinds.items()}
+        counts = Counter(
+            {"time did not advance": int(state["not_advanced"]), "clock jump": int(state["jumps"])}
+        )
+        counts["state numerical"] = int(state["lost"])
         for k, sensor in enumerate(self.model.sensor_names):
             for name in ("gated", "not_finite", "numerical"):
                 counts[f"{sensor} {name.replace('_', ' ')}"] = int(state[name][k])
-        return {kind: n for kind, n in counts.items() if n}
+        return dict(+counts)
 
 
 def run_filter(

@@ -60,9 +60,9 @@ class WheelSlip:
         for name in (speed, "yaw_rate_radps", *["speed_y_mps"] * robot.steered, *robot.steer_rows):
             if name not in states:
                 raise DataError(f"the track has no state {name!r}, only {', '.join(states)}")
-        slips = [f"slip_speed_{wheel}_mps" for wheel in robot.wheels]
+        names = [speed, "speed_y_mps", "yaw_rate_radps", *map("steer_{}_rad".format, robot.wheels)]
+        slips = list(map("slip_speed_{}_mps".format, robot.wheels))
         self._oldest_s = math.inf if blind else (LONGEST_S if slips[0] in states else STALE_AFTER_S)
-        names = [speed, "speed_y_mps", "yaw_rate_radps", *(f"steer_{wheel}_rad" for wheel in robot.wheels)]
         names += [""] * len(slips) if blind else slips
         self._places, self._positions_m = places_among(names, states), np.array(robot.wheel_positions_m)
         self._variance = wheel_speed_scatter_mps(robot) ** 2
@@ -99,14 +99,11 @@ def wheel_slip(track: StateTrack, table: MeasurementTable, robot: Robot, blind: 
     if not np.array_equal(track.time_s, table.time_s):
         raise DataError("the track and the measurements are not on one clock: filter this table")
     time_s = table.time_s[:, None]
-
-    def since_s(rows: tuple[str, ...]) -> Array:
-        known = np.isfinite(table.columns(rows))
-        return np.asarray(time_s - np.maximum.accumulate(np.where(known, time_s, -np.inf), axis=0))
-
-    unmeasured_s = since_s(robot.wheel_rows)
-    if robot.steered:
-        unmeasured_s = np.maximum(unmeasured_s, since_s(robot.steer_rows))
+    unmeasured_s = np.zeros((len(time_s), len(robot.wheels)))
+    for rows in (robot.wheel_rows, robot.steer_rows):  # of a robot that steers
+        if rows:
+            measured_s = np.where(np.isfinite(table.columns(rows)), time_s, -np.inf)
+            unmeasured_s = np.maximum(unmeasured_s, time_s - np.maximum.accumulate(measured_s, axis=0))
     speeds, age_s = robot.wheel_speeds_mps(table.columns(robot.wheel_rows)), track.reference_age_s
     slip = WheelSlip(robot, track.states, blind)(track.mean, track.cov, speeds, age_s, unmeasured_s)
     return SlipTrack(track.time_s, *slip, robot.wheels, age_s > STALE_AFTER_S)
@@ -209,14 +206,15 @@ def slip_figures(
         speed = np.abs(np.interp(slip.time_s, time_s[known], speed_mps[known], left=np.nan, right=np.nan))
     first = np.searchsorted(slip.time_s, slip.time_s - STEADY_BEFORE_S - 1e-9)
     last = np.searchsorted(slip.time_s, slip.time_s + STEADY_AFTER_S + 1e-9)
-    change = np.array([np.ptp(speed[a:b]) for a, b in zip(first, last, strict=True)])
+    change = np.empty(speed.size)
+    for k in range(speed.size):
+        change[k] = np.ptp(speed[first[k] : last[k]])
     started = slip.time_s - slip.time_s[:1] >= STEADY_BEFORE_S - 1e-9
     moving = speed > STEADY_SPEED_MPS
     steady = moving & started & (change < STEADY_CHANGE_MPS)
     ratio = slip.slip_ratio if rolling is None else slip.slip_ratio * rolling
-    in_steady, transient = (
-        part[np.isfinite(part)] for part in (ratio[steady], np.abs(ratio[moving & ~steady]))
-    )
+    known = np.isfinite(ratio)
+    in_steady, transient = ratio[known & steady[:, None]], ratio[known & (moving & ~steady)[:, None]]
     mean = float(in_steady.mean()) if in_steady.size else math.nan
-    peak = float(transient.max()) if transient.size else math.nan
+    peak = float(np.abs(transient).max()) if transient.size else math.nan
     return SlipFigures(read_only(steady, np.bool_), mean, peak)

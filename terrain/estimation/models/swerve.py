@@ -67,7 +67,17 @@ import math
 import numpy as np
 
 from terrain.errors import ConfigError
-from terrain.estimation.feed import CAMERA_ROWS, DERIVED_ROWS, GNSS_ROWS, ROWS, UNSEEN_AFTER_S
+from terrain.estimation.feed import (
+    CAMERA_ROWS,
+    CHANGE,
+    DERIVED_ROWS,
+    GNSS_ROWS,
+    GROWTH,
+    ROWS,
+    SEEN_AGE,
+    UNSEEN_AFTER_S,
+    VIBRATION,
+)
 from terrain.estimation.filter import FilterModel
 from terrain.kernels import inner, njit
 from terrain.kinematics.wheels import in_wheel_frame, point_velocity
@@ -81,7 +91,7 @@ THESIS_SAMPLE_TIME_S = 0.02
 
 _FADING_PER_S = 3.0  # of the acceleration of vio15: a third of a second, shorter than a start and a stop
 _GYRO_FADING_PER_S, _ACCEL_FADING_PER_S = 2e-4, 8e-4  # of biases: with their walks, as uncertain as at first
-_STEER_ROWS = tuple(f"steer_{i}_rad" for i in (1, 2, 3))
+_WHEEL_ROWS, _STEER_ROWS, _REST_ROWS = ROWS[:3], ROWS[7:10], DERIVED_ROWS[-3:]
 # What is known of each state of a robot that was just switched on, and how far it walks within a second, as standard
 # deviations; the first twelve are those of all filters, in the order of (6.1).
 _STATES: dict[str, tuple[float, float]] = {
@@ -93,7 +103,7 @@ _STATES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("accel_x_mps2", "accel_y_mps2"), (1.0, 2.0)),
     **dict.fromkeys(_STEER_ROWS, (0.3, 0.1)),
     "gyro_bias_radps": (0.01, 2e-4),
-    **{f"slip_speed_{i}_mps": (0.2, 0.03) for i in (1, 2, 3)},
+    **dict.fromkeys(("slip_speed_1_mps", "slip_speed_2_mps", "slip_speed_3_mps"), (0.2, 0.03)),
     "imu_yaw_offset_rad": (0.01, 3.5e-4),
     **dict.fromkeys(("accel_bias_x_mps2", "accel_bias_y_mps2"), (0.05, 2e-3)),
 }
@@ -101,8 +111,6 @@ _N_SHARED, _POSITION, _SITE_STD_M = 12, ("position_x_m", "position_y_m"), 100.0
 _X, _Y, _YAW, _VX, _VY, _W, _AX, _AY = range(8)  # places in the state
 _STEER, _BIAS, _SLIP, _OFFSET, _ACCEL_BIAS = 8, 11, 12, 15, 16
 
-_WHEEL_ROWS = ROWS[:3]
-_REST_ROWS = DERIVED_ROWS[-3:]
 # Rows of each sensor, in the order in which they are judged, each after those that it rests on: turning, speed, and
 # last the wheels, which may slip.  What a sample scatters by on a robot that moves, with vibration and delays, is
 # chosen on simulated runs so that the errors of vio15 are on average those that it states; likelihood is no guide where
@@ -116,14 +124,17 @@ _SENSORS: dict[str, tuple[tuple[str, ...], float | tuple[float, ...]]] = {
     "gnss_position": (GNSS_ROWS[:2], 0.02),
     "gnss_speed": (GNSS_ROWS[2:], 0.03),
     "accel": (("accel_x_mps2", "accel_y_mps2"), 0.03),
-    **{row.removesuffix("_rad"): ((row,), 0.0005) for row in _STEER_ROWS},
+    "steer_1": (_STEER_ROWS[:1], 0.0005),
+    "steer_2": (_STEER_ROWS[1:2], 0.0005),
+    "steer_3": (_STEER_ROWS[2:], 0.0005),
     # of the circumferential speed in m/s, mostly the ripple of the Hall steps
-    **{row.removesuffix("_radps"): ((row,), 0.007) for row in _WHEEL_ROWS},
+    "wheel_1": (_WHEEL_ROWS[:1], 0.007),
+    "wheel_2": (_WHEEL_ROWS[1:2], 0.007),
+    "wheel_3": (_WHEEL_ROWS[2:], 0.007),
     "rest": (_REST_ROWS, (0.005, 0.005, 0.002)),
 }
 _SLIP_STD_MPS = 0.15  # wheel speed minus ground speed, where both are measured and slip is no state (vio12)
 _HELD = ("camera_yaw_rate", "camera_yaw", "gyro", "camera_speed", "accel", "rest")
-_ANGLES = ("yaw_rad", *_STEER_ROWS, "imu_yaw_rad", "camera_yaw_rad")
 # Behind the low-pass of the encoders' rates, 0.1 s, a sample scatters by a third of what it did; it counts as
 # half, as then the scatter of one tick is much like that of the tick before.
 _LOW_PASSED = 0.5
@@ -283,43 +294,36 @@ def make_filter(name: str, robot: Robot, with_gnss: bool = False, thesis: bool =
         lever_m = robot.camera.lever_x_m, robot.camera.lever_y_m
     states = tuple(_STATES)[: None if has_slip else _N_SHARED]
     rows = (*ROWS[:10], *CAMERA_ROWS * has_camera, *_REST_ROWS * has_slip, *GNSS_ROWS * with_gnss)
-    sensors = {sensor: group for sensor, (group, _) in _SENSORS.items() if group[0] in rows}
-    initial_std, walk_std = np.array([_STATES[state] for state in states]).T
+    initial_std, walk_std = np.array(list(_STATES.values()))[: len(states)].T
     if with_gnss:
         initial_std[:2] = _SITE_STD_M
-    process, initial = np.diag(walk_std**2), initial_std**2
-    std = {sensor: np.broadcast_to(_SENSORS[sensor][1], len(group)) for sensor, group in sensors.items()}
-    for row in _WHEEL_ROWS:
-        sensor = row.removesuffix("_radps")
-        std[sensor] = (np.array([_SLIP_STD_MPS]) if name == "vio12" else std[sensor]) / robot.wheel_radius_m
+    process, initial, least = np.diag(walk_std**2), initial_std**2, dict[str, float]()
     if robot.describes("sensors"):
         described = robot.sensors
-        tick_s = 1.0 / described.wheels_rate_hz
-
-        def averaged(rate_hz: float) -> float:
-            return math.sqrt(described.wheels_rate_hz / max(rate_hz, described.wheels_rate_hz))
-
-        imu = averaged(described.imu_rate_hz)
-        least = {
-            "accel": described.accel_std_mps2 * imu,
-            "gyro": described.gyro_std_radps * imu,
-            "imu_yaw": described.yaw_std_rad * imu,
-            **{row.removesuffix("_rad"): described.steering_std_rad * _LOW_PASSED for row in _STEER_ROWS},
-        }
+        wheels_hz = described.wheels_rate_hz
+        imu = math.sqrt(wheels_hz / max(described.imu_rate_hz, wheels_hz))
+        least["accel"], least["gyro"] = described.accel_std_mps2 * imu, described.gyro_std_radps * imu
+        least["imu_yaw"] = described.yaw_std_rad * imu
+        least |= dict.fromkeys(("steer_1", "steer_2", "steer_3"), described.steering_std_rad * _LOW_PASSED)
         if robot.describes("camera"):
-            camera, seen = robot.camera, _LOW_PASSED * averaged(robot.camera.rate_hz)
-            least["camera_speed"] = camera.speed_std_mps * seen
+            camera = robot.camera
+            seen = _LOW_PASSED * math.sqrt(wheels_hz / max(camera.rate_hz, wheels_hz))
+            least["camera_speed"], least["camera_yaw"] = (
+                camera.speed_std_mps * seen,
+                camera.yaw_std_rad * seen,
+            )
             least["camera_yaw_rate"] = camera.yaw_rate_std_radps * seen
-            least["camera_yaw"] = camera.yaw_std_rad * seen
-        std = {sensor: np.maximum(values, least.get(sensor, 0.0)) for sensor, values in std.items()}
         for speed, accel in ((_VX, _AX), (_VY, _AY)):
-            walk = process[accel, accel]
+            walk, tick_s = process[accel, accel], 1.0 / wheels_hz
             process[speed, accel] = process[accel, speed] = walk * tick_s / 2.0
             process[speed, speed] += walk * tick_s**2 / 3.0
-    std_of_row = {
-        row: value for sensor, group in sensors.items() for row, value in zip(group, std[sensor], strict=True)
-    }
-    variance = np.array([std_of_row[row] ** 2 for row in rows])
+    sensors, variance = dict[str, tuple[str, ...]](), np.empty(len(rows))
+    for sensor, (group, scatter) in _SENSORS.items():
+        if group[0] in rows:
+            sensors[sensor], std = group, np.array(scatter)
+            if group[0] in _WHEEL_ROWS:
+                std = np.array(_SLIP_STD_MPS if name == "vio12" else scatter) / robot.wheel_radius_m
+            variance[list(map(rows.index, group))] = np.maximum(std, least.get(sensor, 0.0)) ** 2
     if thesis:
         r, q, p0 = _THESIS[has_camera]
         process = np.diag(walk_std**2)
@@ -346,20 +350,16 @@ def make_filter(name: str, robot: Robot, with_gnss: bool = False, thesis: bool =
         measurement_variance=variance,
         initial_variance=initial,
         inputs=DERIVED_ROWS[1:4] if has_slip else (),
-        references=tuple(sensor for sensor in sensors if sensor in ("camera_speed", "gnss_speed")),
-        held=tuple(sensor for sensor in sensors if has_slip and sensor in _HELD),
+        references=(*("camera_speed",) * has_camera, *("gnss_speed",) * with_gnss),
+        held=_HELD if has_slip else (),
         positions=_POSITION,
-        angle_states=tuple(state for state in states if state in _ANGLES),
-        angle_rows=tuple(row for row in rows if row in _ANGLES),
+        angle_states=("yaw_rad", *_STEER_ROWS),
+        angle_rows=("imu_yaw_rad", *_STEER_ROWS, *CAMERA_ROWS[3:] * has_camera),
     )
 
 
 # Places of the derived rows among those of the feed, which all tables of a swerve robot begin with.
-_VIBRATION, _GROWTHS, _CHANGES = (
-    ROWS.index(DERIVED_ROWS[0]),
-    *([ROWS.index(row) for row in DERIVED_ROWS[first : first + 3]] for first in (1, 4)),
-)
-_CAMERA_AGE = ROWS.index("camera_age_s")
+_GROWTHS, _CHANGES = slice(GROWTH, GROWTH + 3), slice(CHANGE, CHANGE + 3)
 SHAKEN_S, CHANGED_RATIO, UNSEEN_RATIO, SHAKEN_TURN_S, SHAKEN_ACCEL_RATIO = 0.09, 0.4, 1.0 / 3.0, 0.02, 0.5
 
 
@@ -396,10 +396,10 @@ def scheduled(
     if variance is None or not is_scheduled:
         return variance, None, None
     known = np.where(np.isnan(z), 0.0, z)
-    shaken, changed, growth = known[:, [_VIBRATION]], known[:, _CHANGES], known[:, _GROWTHS]
-    vibration = np.where(np.isnan(z[:, [_VIBRATION]]), UNKNOWN_MPS2, shaken)
+    shaken, changed, growth = known[:, [VIBRATION]], known[:, _CHANGES], known[:, _GROWTHS]
+    vibration = np.where(np.isnan(z[:, [VIBRATION]]), UNKNOWN_MPS2, shaken)
     variance[:, 3:5] += (SHAKEN_ACCEL_RATIO * vibration) ** 2
-    unseen = ~(z[:, [_CAMERA_AGE]] <= UNSEEN_AFTER_S)
+    unseen = ~(z[:, [SEEN_AGE]] <= UNSEEN_AFTER_S)
     shaken_s = SHAKEN_S * (1.0 - (1.0 - UNSEEN_RATIO) * unseen)
     walk = np.zeros((len(z), len(model.states)))
     walk[:, _SLIP:_OFFSET] = (shaken_s * shaken) ** 2 + 2.0 * CHANGED_RATIO**2 * changed

@@ -87,11 +87,11 @@ def test_nees_is_the_squared_error_over_its_covariance_with_angles_wrapped():
     truth = np.array([[-3.1, 1.2], [3.1, np.nan]])
     error = np.array([6.2 - 2 * np.pi, -0.2])
     np.testing.assert_allclose(nees(track, truth), [error @ np.linalg.solve(cov[0], error), np.nan])
-    np.testing.assert_allclose(nees(track, truth[:, :1], ["yaw_rad"]), error[0] ** 2 / 0.04)
+    np.testing.assert_allclose(nees(track, truth, ["yaw_rad"]), error[0] ** 2 / 0.04)
     with pytest.raises(DataError, match="the track has no state 'slip_1_ratio': it has yaw_rad, speed_mps"):
         nees(track, truth, ["yaw_rad", "slip_1_ratio"])
-    with pytest.raises(DataError, match=r"truth has shape \(2, 2\), \(2, 1\) is needed"):
-        nees(track, truth, ["yaw_rad"])
+    with pytest.raises(DataError, match=r"truth has shape \(2, 1\), \(2, 2\) is needed"):
+        nees(track, truth[:, :1], ["yaw_rad"])
 
 
 ROBOT = load_robot("agrimaro")
