@@ -83,10 +83,10 @@ def consistency_report(track: StateTrack, truth: Array | None = None) -> dict[st
 
 
 def nees(track: StateTrack, truth: Array, states: Sequence[str] | None = None) -> Array:
-    """Return the squared error over its covariance (n,) of all states, or some; NaN where their truth (n, d) is.
+    """Return the squared error over its covariance (n,) of all states, or some; NaN where their truth is.
 
-    Errors of angles (states in ``rad``) are wrapped.  The truth is of all states; ``DataError`` where its shape does not
-    fit, or there is no such state.
+    Errors of angles (states in ``rad``) are wrapped.  The truth (n, d) is of all states; ``DataError`` where its shape
+    does not fit, or there is no such state.
     """
     states = track.states if states is None else tuple(states)
     for state in states:
