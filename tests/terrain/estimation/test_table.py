@@ -257,12 +257,17 @@ def test_the_gyro_row_is_the_mean_since_the_last_tick():
     assert abs(sampled - heading) > 1.0
 
 
-def test_rest_gives_the_mean_of_each_second():
-    bias_radps = 0.03
-    _, _, rest = rows_of(skid_run(bias_radps + STILL))
+def test_rest_gives_the_mean_of_each_second_and_a_turn_that_begins_in_one_is_no_part_of_it():
+    _, _, rest = rows_of(skid_run(0.03 + STILL))
     known = rest[np.isfinite(rest)]
     assert known.size == pytest.approx(WHEELS_S[-1] / REST_S, rel=0.1)
-    np.testing.assert_allclose(known, bias_radps, atol=6 * 0.002 / np.sqrt(90))
+    np.testing.assert_allclose(known, 0.03, atol=6 * 0.002 / np.sqrt(90))
+    time_s, _, rest = rows_of(skid_run(STILL + 0.5 * np.clip(GYRO_S - 10.0, 0.0, 1.0)))
+    assert np.nanmax(np.abs(rest)) < 0.002
+    assert np.isnan(rest[(time_s > 10.3) & (time_s < 30.0)]).all()
+    feed = new_feed()[0]  # a clock that is set back starts anew
+    rows = [rest_at(at_s, 0.0, 0.0, 0.01, feed) for at_s in (5.0, 5.5, 2.0, 2.5, 3.0)]
+    np.testing.assert_array_equal(rows, [np.nan] * 4 + [0.01])
 
 
 @pytest.mark.parametrize(
@@ -279,17 +284,3 @@ def test_rest_gives_the_mean_of_each_second():
 )
 def test_what_is_no_rest_gives_nothing(gyro_radps, speed_mps):
     assert np.isnan(rows_of(skid_run(gyro_radps, speed_mps))[2]).all()
-
-
-def test_a_turn_that_begins_in_a_second_of_rest_is_no_part_of_the_row():
-    gyro = STILL + 0.5 * np.clip(GYRO_S - 10.0, 0.0, 1.0)
-    time_s, _, rest = rows_of(skid_run(gyro))
-    assert np.nanmax(np.abs(rest)) < 0.002
-    assert np.isnan(rest[(time_s > 10.3) & (time_s < 30.0)]).all()
-
-
-def test_a_clock_that_is_set_back_starts_anew():
-    feed = new_feed()[0]
-    rows = [rest_at(time_s, 0.0, 0.0, 0.01, feed) for time_s in (5.0, 5.5, 2.0, 2.5, 3.0)]
-    assert np.isnan(rows[:-1]).all()
-    assert rows[-1] == 0.01

@@ -177,35 +177,28 @@ def test_an_interval_of_a_drive_is_found_with_its_times():
     assert seconds["stuck"] == pytest.approx(interval.end_s - interval.start_s - STUCK_AFTER_S, abs=0.2)
 
 
-@pytest.mark.parametrize(
-    ("left_mps", "right_mps", "options"),
-    [
-        (0.5, 0.5, {}),
+def test_what_wheels_and_gyro_cannot_show_is_unknown():
+    short_turns = 0.3 * np.sign(np.sin(4 * TIME_S))
+    for left_mps, right_mps, options in (
+        (0.5, 0.5, {}),  # straight, an arc, one side, slow
         (-0.5, -0.4, {}),
         (0.0, 0.4, {}),
         (-0.02, 0.02, {}),
         (-0.2, 0.2, {"has_gyro": False}),
-        (-0.2, 0.2, {"std_radps": 0.05}),
+        (-0.2, 0.2, {"std_radps": 0.05}),  # of the bias
         (-0.2, np.nan, {}),
         (-np.inf, 0.2, {}),
         (-1e6, 1e6, {}),
-        (0.3 * np.sign(np.sin(4 * TIME_S)), -0.3 * np.sign(np.sin(4 * TIME_S)), {}),
-    ],
-    ids=["straight", "arc", "one side", "slow", "no gyro", "bias", "a side", "inf", "1e6", "short turns"],
-)
-def test_what_wheels_and_gyro_cannot_show_is_unknown(left_mps, right_mps, options):
-    assert (motion(left_mps, right_mps, 0.001, **options) == Motion.UNKNOWN).all()
-
-
-def test_gaps_and_a_clock_set_back_start_anew():
-    gap = TIME_S + 10.0 * (TIME_S > 15.0)
-    found = motion(-0.2, 0.2, 0.0, time_s=gap)
-    first = int(np.argmax(gap > 15.0))
-    assert found[first - 1] == Motion.STUCK
-    assert (found[first : first + 5] == Motion.UNKNOWN).all()
-    assert found[-1] == Motion.STUCK
-    back = np.where(TIME_S > 15.0, TIME_S - 12.0, TIME_S)
-    assert (motion(-0.2, 0.2, 0.0, time_s=back)[first : first + 5] == Motion.UNKNOWN).all()
+        (short_turns, -short_turns, {}),
+    ):
+        assert (motion(left_mps, right_mps, 0.001, **options) == Motion.UNKNOWN).all(), (left_mps, right_mps)
+    # gaps, and a clock that is set back, start anew
+    later = TIME_S > 15.0
+    first = int(later.argmax())
+    for stamps in (TIME_S + 10.0 * later, TIME_S - 12.0 * later):
+        found = motion(-0.2, 0.2, 0.0, time_s=stamps)
+        assert (found[[first - 1, -1]] == Motion.STUCK).all()
+        assert (found[first : first + 5] == Motion.UNKNOWN).all()
 
 
 # -- measured runs

@@ -79,8 +79,7 @@ def jacobians(model, x, dt=DT_S):
     return x_next, f, z_hat, h
 
 
-@pytest.mark.parametrize("with_gnss", [False, True])
-@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize(("name", "with_gnss"), [(name, True) for name in FILTERS] + [("vio15", False)])
 def test_jacobians_are_those_of_finite_differences(name, with_gnss):
     model = make_filter(name, ROBOT, with_gnss)
     rng = np.random.default_rng(0)
