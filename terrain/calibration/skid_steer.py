@@ -54,8 +54,9 @@ MIN_YAW_RATE_RADPS = 0.15  #: Slower turns are as small as their errors.
 TRIMMED = 0.2  #: Part of the stretches that is left out at either end: wheels that spin, poses that jump.
 N_LAGS = round(1.0 / GRID_S)  #: That are searched to either side.
 MIN_GROUPS = 4
-#: Of lidar (logged at 10 Hz) and wheels (20 Hz): by which the peak between samples is off at some phase of the grid.
-LIDAR_RESOLUTION_S, WHEELS_RESOLUTION_S = 0.004, 0.0015
+#: By which a parabola through three lags is off at some phase of the grid.  What the lidar's 10 Hz leave between
+#: samples differs from turn to turn, and is in the scatter of the runs.
+RESOLUTION_S = 0.001
 #: Of squares of yaw rates in rad^2/s^2, over a run: less are no turns, and show no delay.
 MIN_TURN_SUM = 0.5
 RADIUS, TRACK = "identified.rolling_radius_m", "identified.effective_track_m"
@@ -136,8 +137,8 @@ def identify(runs: Sequence[RunLog], wheel_radius_m: float, hard: Sequence[str])
             assumed,
         ),
         (TRACK, track, "steady stretches", 0.0, f"skidding included, by the described radius, on {where}"),
-        (LIDAR_DELAY, partial(best_lag, 0), "runs", LIDAR_RESOLUTION_S, behind),
-        (WHEELS_DELAY, partial(best_lag, 1), "runs", WHEELS_RESOLUTION_S, behind),
+        (LIDAR_DELAY, partial(best_lag, 0), "runs", RESOLUTION_S, behind),
+        (WHEELS_DELAY, partial(best_lag, 1), "runs", RESOLUTION_S, behind),
     ]
     findings = [over_groups(groups, *row) for row in rows]
     return findings if any_gyro else [*findings[:3], *undetermined([WHEELS_DELAY], "there is no gyro")]

@@ -235,28 +235,22 @@ def reduction_ratio(stretches: Sequence[Steady], robot: Robot) -> Finding:
     Notes
     -----
     ``ratio = (1 - s) motor rate * radius / speed``, means over the three wheels, between which pushing
-    cancels; the slip s lies anywhere in :data:`SLIP_RATIO`.  The interval is that over runs, or over single wheels
-    with fewer than three runs, because tyres differ.  Motor rates and speeds tell the ratio over the radius
-    and no more (thesis 3.3.2 turns wheels by hand).
+    cancels; the slip s lies anywhere in :data:`SLIP_RATIO`.  The interval is that over runs, or over stretches
+    with fewer than three runs.  Motor rates and speeds tell the ratio over the radius and no more: wheels that
+    differ from the described radius are not in it (thesis 3.3.2 turns wheels by hand).
     """
     name = "motors.reduction_ratio"
-    if not stretches:
-        return undetermined([name], f"there is no steady stretch: {REQUIRED_MOTION}")[0]
-    ratios: dict[str, list[Steady]] = {}
-    for stretch in stretches:
-        ratios.setdefault(stretch.run_id, []).append(stretch)
+    if len(stretches) < 2:
+        return undetermined([name], f"{len(stretches)} steady stretches: {REQUIRED_MOTION}")[0]
+    run_of_stretch = [each.run_id for each in stretches]
+    runs, number = np.unique(run_of_stretch, return_inverse=True)
+    group = number if len(runs) >= 3 else np.arange(len(stretches))
+    weight = np.array([each.n for each in stretches])
     single = np.array(
-        [
-            np.average(
-                [each.motor_radps * robot.wheel_radius_m / each.speed_mps for each in own],
-                axis=0,
-                weights=[each.n for each in own],
-            )
-            for own in ratios.values()
-        ]
+        [(each.motor_radps * robot.wheel_radius_m / each.speed_mps).mean() for each in stretches]
     )
-    scatter = single.mean(axis=1) if len(ratios) >= 3 else single.ravel()
-    least, most = ((1 - slip) * float(single.mean()) for slip in reversed(SLIP_RATIO))
+    scatter = np.bincount(group, weight * single) / np.bincount(group, weight)
+    least, most = ((1 - slip) * float(scatter.mean()) for slip in reversed(SLIP_RATIO))
     std = scatter.std(ddof=1) / math.sqrt(len(scatter))
     half = float(half_width(std, len(scatter) - 1, bounded=(most - least) / 2))
-    return around(name, (least + most) / 2, half, len(stretches), "stretches", ratios, RATIO)
+    return around(name, (least + most) / 2, half, len(stretches), "stretches", run_of_stretch, RATIO)

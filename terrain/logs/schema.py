@@ -110,8 +110,6 @@ POSE_CHANNELS = ("position_x_m", "position_y_m", "yaw_rad")
 
 TWIST = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")  #: Of a stream of twists of the body
 
-TWIST = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")  #: Of a stream of twists of the body
-
 ESTIMATOR_CHANNELS = (*TWIST, "accel_x_mps2", "accel_y_mps2")
 """States of a filter that go into windows."""
 

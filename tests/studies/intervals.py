@@ -19,6 +19,7 @@ from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
 from pipelines.report.tree import Column, Report, Table
 from terrain.calibration.description import findings_of
+from terrain.calibration.lag import STAMP_S
 from terrain.calibration.odometry import SLIP, fit_odometry, legs_of_poses, level
 from terrain.calibration.sensors import fit_gravity
 from terrain.calibration.skid_steer import SLIP_RATIO as RADIUS_SLIP_RATIO
@@ -124,8 +125,9 @@ def skid_run(radius_m, track_m, lidar_s, wheels_s, seed, terrain="asphalt", slip
     """A run of a robot whose radius, track and delays are known; lidar at 10 Hz, gyro at 50, wheels at 20."""
     rng = np.random.default_rng(seed)
     kernel = np.exp(-np.arange(60) / 15.0)
-    speed = np.repeat(rng.uniform(-1.5, 1.5, n_steps), 300)
-    turn = np.repeat(rng.uniform(-0.8, 0.8, n_steps) * rng.integers(0, 2, n_steps), 300)
+    n_samples = rng.integers(270, 331, n_steps)  # commands change at any phase of the sensors' samples
+    speed = np.repeat(rng.uniform(-1.5, 1.5, n_steps), n_samples)
+    turn = np.repeat(rng.uniform(-0.8, 0.8, n_steps) * rng.integers(0, 2, n_steps), n_samples)
     speed, turn = (np.convolve(signal, kernel / kernel.sum())[: len(signal)] for signal in (speed, turn))
     t = np.arange(len(speed)) / 100.0
 
@@ -228,7 +230,7 @@ def _six_positions(seed: int) -> Iterator[Interval]:
 
 
 def _swerve(seed: int) -> Iterator[Interval]:
-    """A robot whose zeros are off by up to half a step of their encoders, and wheels that slip as is assumed."""
+    """A robot whose zeros are off by up to half a step of their encoders, and slip and stamps as is assumed."""
     rng, soil, steps = np.random.default_rng(seed), SOILS["tiles"], HIDDEN.sensors.steering_steps_ratio
     off_rad = 2 * np.pi / steps * rng.uniform(-0.5, 0.5, 3)
     zeros = {f"zero_{i}_rad": zero for i, zero in enumerate(HIDDEN.steering_zeros_rad + off_rad, start=1)}
@@ -241,7 +243,11 @@ def _swerve(seed: int) -> Iterator[Interval]:
     runs = [drive_hidden("stand", 10 * seed + k, duration_s=8.0, robot=robot) for k in range(3)]
     runs += [drive_hidden(name, seed, robot=robot) for name in ("complex", "starts")]
     runs += [six_positions_log(robot, 10 * seed + k, hold_s=3.0, run_id=f"bench_{k}") for k in range(3)]
-    description = read_yaml(description_file("agrimaro"))
+    late_s, description = rng.uniform(-STAMP_S, STAMP_S), read_yaml(description_file("agrimaro"))
+    for k, run in enumerate(runs):
+        imu = run.streams["imu"]
+        imu = Stream(imu.time_s + late_s, imu.values, imu.channels)
+        runs[k] = replace(run, streams={**run.streams, "imu": imu})
     for finding in findings_of(runs, description, NOMINAL, ("tiles",)):
         section, _, name = finding.parameter.partition(".")
         if finding.determined and name:
@@ -290,6 +296,7 @@ def _rollers(seed: int) -> Iterator[Interval]:
                 body_slip=np.array([1.0 - twist @ ahead / 0.1]),
                 body_side=np.array([side]),
                 wheel_speed_mps=wheels,
+                known=np.ones(1, bool),
             )
             runs.append((slip, surface))
     found = roller_findings([slip for slip, _ in runs], [name for _, name in runs], robot, list(ratio))

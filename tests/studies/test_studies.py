@@ -119,6 +119,14 @@ def test_intervals_contain_the_true_peaks_of_learned_slip():
     assert row.error_median < 0.03
 
 
+@pytest.mark.slow
+def test_every_use_of_intervals_is_drawn_and_identified():
+    uses = [use for use in intervals.USES if use != "slip-peak"]
+    rows = intervals.run(intervals.Settings(repeats=2, seed=1500, uses=",".join(uses))).rows
+    assert {row.use for row in rows} == set(uses)
+    assert np.mean([row.coverage for row in rows]) > 0.8
+
+
 def test_the_interval_of_a_probability_is_exact():
     assert intervals.clopper_pearson(0, 5) == (0.0, pytest.approx(1 - 0.025 ** (1 / 5)))
     assert intervals.clopper_pearson(5, 5)[0] == pytest.approx(0.025 ** (1 / 5))

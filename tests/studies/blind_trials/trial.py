@@ -50,7 +50,7 @@ from terrain.effects import (
 )
 from terrain.errors import DataError
 from terrain.kinematics.logged_wheels import with_wheel_speeds
-from terrain.logs.drive import CHANNELS as TWIST_CHANNELS
+from terrain.logs.schema import TWIST
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import BicycleRobot, Robot, load_robot
 from terrain.simulation.plants.planar import Ground, spread_numbers
@@ -311,7 +311,7 @@ def with_lidar(run: RunLog) -> RunLog:
     seen, heading = run.streams["odometry"], run.streams["lidar"]
     values = np.column_stack([seen.values, heading.values])
     streams = {name: stream for name, stream in run.streams.items() if name != "odometry"}
-    return replace(run, streams={**streams, "lidar": Stream(seen.time_s, values, TWIST_CHANNELS)})
+    return replace(run, streams={**streams, "lidar": Stream(seen.time_s, values, TWIST)})
 
 
 def as_command_log(run: RunLog) -> RunLog:
@@ -319,7 +319,7 @@ def as_command_log(run: RunLog) -> RunLog:
     full = with_lidar(run).streams
     wheels = tuple(name for name in full["wheels"].channels if name.startswith("speed_"))
     imu = ("gyro_z_radps", *(f"accel_{axis}_mps2" for axis in "xyz"))
-    layout = {"wheels": wheels, "imu": imu, "lidar": TWIST_CHANNELS}
+    layout = {"wheels": wheels, "imu": imu, "lidar": TWIST}
     end_s = min(full[name].time_s[-1] for name in layout)
     time_s, streams = np.arange(1, int(end_s * RATE_HZ)) / RATE_HZ, {}
     for name, channels in layout.items():
