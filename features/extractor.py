@@ -63,11 +63,6 @@ class Feature(NamedTuple):
     unit: str
     sets: frozenset[str]
 
-    @property
-    def label(self) -> str:
-        """Name with its unit, as in tables and plots."""
-        return f"{self.name} [{self.unit}]"
-
 
 def derived_channels(values: Array, channels: Sequence[str]) -> tuple[Array, tuple[str, ...]]:
     """Return norms of vectors, and total and difference of currents, as further channels with their names.
@@ -243,12 +238,14 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
             raise DataError(f"the windows hold no channel of the signal sets {', '.join(self.signal_sets)}")
         return self
 
-    def transform(self, X: Windows) -> Array:
-        """Return the features (n_windows, n_features); NaN where a feature is not defined.
+    def features_of(self, windows: Windows) -> Array:
+        """Return the features (n_windows, n_features), NaN where not defined.
 
         ``DataError`` where the windows are of another kind than those of ``fit``.
         """
-        return self.features_of(X)
+        return self.named(windows)[1]
+
+    transform = features_of  # of a subclass, whose matrix holds more or other columns, another
 
     def equals(self, other: FeatureExtractor) -> bool:
         """Whether both give the same features of a window, but for rounding."""
@@ -257,10 +254,6 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
         )
         its_hz, rates_hz = other.layout_.rate_hz, self.layout_.rate_hz.items()
         return own == its and all(abs(rate / its_hz[name] - 1.0) <= SAME_RATE for name, rate in rates_hz)
-
-    def features_of(self, windows: Windows) -> Array:
-        """Return the features (n_windows, n_features), NaN where not defined; errors as :meth:`selected`."""
-        return self.named(windows)[1]
 
     def named(self, windows: Windows) -> tuple[list[Feature], Array]:
         """Return the features beside their values."""
@@ -331,20 +324,10 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
             values[stream] = array if held == n else np.take(array, mirrored, axis=2)
         return values
 
-    def samples(self, windows: Windows) -> Array:
-        """Return the samples (n_windows, n_columns) of all channels, stream by stream, centred where they must be."""
-        parts = []
-        for stream, values in self.selected(windows).items():
-            names = self.layout_.channels[stream]
-            centred = np.array([is_centred(stream, name, self.level_sets) for name in names])[:, None]
-            mean = np.where(centred, values.mean(axis=2, keepdims=True), 0.0)
-            parts.append((values - mean).reshape(len(values), -1))
-        return np.concatenate(parts, axis=1)
-
     def get_feature_names_out(self, input_features: Any = None) -> Array:
         """Return the name of each column with its unit."""
         check_is_fitted(self)
-        return np.array([feature.label for feature in self.features_], dtype=object)
+        return np.array([f"{name} [{unit}]" for name, unit, _ in self.features_], dtype=object)
 
 
 @dataclass(eq=False, repr=False)
@@ -382,9 +365,14 @@ class SampleExtractor(FeatureExtractor):
         return self
 
     def transform(self, X: Windows) -> Array:
-        """Return the matrix (n_windows, n_columns); errors as of the features."""
-        samples = self.samples(X)
-        return np.concatenate([self.features_of(X), samples], axis=1) if self.with_features else samples
+        """Return the matrix (n_windows, n_columns), samples centred where they must be; errors as of the features."""
+        parts = [self.features_of(X)] if self.with_features else []
+        for stream, values in self.selected(X).items():
+            names = self.layout_.channels[stream]
+            centred = np.array([is_centred(stream, name, self.level_sets) for name in names])[:, None]
+            mean = np.where(centred, values.mean(axis=2, keepdims=True), 0.0)
+            parts.append((values - mean).reshape(len(values), -1))
+        return np.concatenate(parts, axis=1)
 
     def get_feature_names_out(self, input_features: Any = None) -> Array:
         """Return the name of each column with its unit."""
@@ -471,7 +459,7 @@ class FunctionExtractor(FeatureExtractor):
                     f"{', '.join(self.own_names_)}"
                 )
             own[row] = list(numbers.values())
-        return np.concatenate([super().transform(X), own], axis=1)
+        return np.concatenate([self.features_of(X), own], axis=1)
 
     def get_feature_names_out(self, input_features: Any = None) -> Array:
         """Return the name of each column, of the package's own features with the unit."""

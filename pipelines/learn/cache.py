@@ -105,7 +105,13 @@ def cached_data(
     chosen = chosen_runs(readable, settings) if isinstance(settings, AlignedRunsSettings) else readable
     used = {head.run_id for head in chosen}
     load_of = dict(zip([head.run_id or str(i) for i, head in enumerate(heads)], loaders, strict=True))
-    _refuse_shared([(load_of[a], load_of[b]) for a, b in pairs if {a, b} <= used], n_jobs, progress)
+    each = [(load_of[a], load_of[b]) for a, b in pairs if {a, b} <= used]
+    compared = parallel(_compared, (), each, n_jobs, "compare runs", progress)
+    if shared := [stretch for found in compared for stretch in found]:
+        raise DataError(
+            f"{'; '.join(sentences(sorted(shared)))}: held out, they would be recognised and not classified; "
+            "leave one of them out by --without, or merge them by --merge-duplicates without --cache"
+        )
     chosen = sorted(chosen, key=lambda head: head.run_id)
     unfitted = recipe_of(settings, settings.recipes[0])
     extractor, signal_sets = unfitted[0], unfitted[0].signal_sets
@@ -114,9 +120,9 @@ def cached_data(
     names = extractor.get_feature_names_out().tolist()
     made_of = _sha256([FORMAT_VERSION, __version__, as_json([rule, layout, signal_sets, names])])
     files = [place / "features" / f"{_sha256([head.digest, made_of])[:32]}.parquet" for head in chosen]
-    todo = [i for i, file in enumerate(files) if _read(file) is None]
-    each = [(load_of[chosen[i].run_id], files[i]) for i in todo]
-    list(parallel(_store_run, (rule, layout, extractor), each, n_jobs, "features", progress))
+    found = zip(chosen, files, strict=True)
+    todo = [(load_of[head.run_id], file) for head, file in found if _read(file) is None]
+    list(parallel(_store_run, (rule, layout, extractor), todo, n_jobs, "features", progress))
     samples, features, moved = _table(chosen, files, rule)
     motion = None if wheel_stream(layout.channels) is None else moved
     runs = trained_runs([head[:4] for head in chosen], samples)
@@ -181,16 +187,6 @@ def _head(place: Path, load: RunLoader) -> tuple[RunHead, Array, Array]:
 
 def _period_s(time_s: Array) -> float:
     return float(np.median(np.diff(time_s))) if len(time_s) > 1 else float("nan")
-
-
-def _refuse_shared(pairs: Sequence[tuple[RunLoader, RunLoader]], n_jobs: int, progress: Progress) -> None:
-    """Raise ``DataError`` where the two runs of a pair hold the same measurements."""
-    compared = parallel(_compared, (), pairs, n_jobs, "compare runs", progress)
-    if found := [each for found in compared for each in found]:
-        raise DataError(
-            f"{'; '.join(sentences(sorted(found)))}: held out, they would be recognised and not classified; "
-            "leave one of them out by --without, or merge them by --merge-duplicates without --cache"
-        )
 
 
 def _compared(first: RunLoader, second: RunLoader) -> Any:

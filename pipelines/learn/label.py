@@ -249,10 +249,23 @@ def time_text(time_s: float) -> str:
     return f"{time_s + 0.0:.6f}".rstrip("0").rstrip(".")
 
 
+INTERVAL = (
+    Column("from s", of=lambda row: time_text(row.start_s)),
+    Column("to s", of=lambda row: time_text(row.end_s)),
+)
+
+
 def report(result: DoubtfulResult | LabelResult | ProposalsResult | AnswersResult) -> Report:
     """Return what is doubtful, was changed, is asked or was written."""
     if isinstance(result, LabelResult):
-        return _label_report(result)
+        done = f"labelled {result.terrain}" if result.terrain else "without a label"
+        labels = Table((*INTERVAL, Column("terrain", of="terrain")), result.labels)
+        return Report(
+            title="Labels",
+            answer=f"{result.run_id}: {time_text(result.start_s)} to {time_text(result.end_s)} s {done}",
+            parts=(labels,) if result.labels else (),
+            next_step=f"terrain inspect {result.folder}",
+        )
     if isinstance(result, ProposalsResult):
         return _proposals_report(result)
     if isinstance(result, AnswersResult):
@@ -263,16 +276,6 @@ def report(result: DoubtfulResult | LabelResult | ProposalsResult | AnswersResul
             f"{result.n_left_open} stretches without one",
             next_step=f"terrain train --data {result.out}",
         )
-    return _doubtful_report(result)
-
-
-INTERVAL = (
-    Column("from s", of=lambda row: time_text(row.start_s)),
-    Column("to s", of=lambda row: time_text(row.end_s)),
-)
-
-
-def _doubtful_report(result: DoubtfulResult) -> Report:
     columns = (
         Column("run", of="run_id"),
         *INTERVAL,
@@ -292,17 +295,6 @@ def _doubtful_report(result: DoubtfulResult) -> Report:
         parts=(Table(columns, result.windows),) if result.windows else (),
         details=(Section("By run", (Table(of_run, result.runs),)),),
         next_step=f"terrain label {result.data} --run ID --from S --to S --terrain NAME",
-    )
-
-
-def _label_report(result: LabelResult) -> Report:
-    done = f"labelled {result.terrain}" if result.terrain else "without a label"
-    labels = Table((*INTERVAL, Column("terrain", of="terrain")), result.labels)
-    return Report(
-        title="Labels",
-        answer=f"{result.run_id}: {time_text(result.start_s)} to {time_text(result.end_s)} s {done}",
-        parts=(labels,) if result.labels else (),
-        next_step=f"terrain inspect {result.folder}",
     )
 
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from pipelines.learn.ground_changes import ChangesResult
     from pipelines.live.model import TerrainModel
     from terrain.control.slip_table import SlipTable
-    from terrain.records import RunLog, SlipTarget, Windows
+    from terrain.records import RunLog, Windows
     from terrain.robots import Robot
 
 EXAMPLE = "terrain predict --data runs/ --model models:/field@champion --out predicted.csv"
@@ -232,7 +232,15 @@ def predict(
         dropped=dict(sum((Counter(cut.dropped) for cut in cuts), Counter())),
         filtered=tuple(each.run_id for each in runs if needs_filter(model.info, each.streams)),
         table_name=table.name,
-        table={terrain: _table_row(table.lookup(terrain)) for terrain in classes},
+        table={
+            terrain: {
+                **{state: targets[state].slip_ratio for state in DRIVE_STATES},
+                "entry": targets["traction"].terrain,
+                "status": ", ".join(dict.fromkeys(targets[state].status for state in DRIVE_STATES)),
+                "source": "; ".join(dict.fromkeys(targets[state].source for state in DRIVE_STATES)),
+            }
+            for terrain, targets in ((terrain, table.lookup(terrain)) for terrain in classes)
+        },
         n_unknown=sum(row.terrain != row.nearest for row in rows),
         n_unsupported=None if model.support is None else sum(row.supported is False for row in rows),
     )
@@ -277,14 +285,6 @@ def _predict_windows(windows: Windows, model: TerrainModel, table: SlipTable) ->
             )
         )
     return rows
-
-
-def _table_row(targets: Mapping[str, SlipTarget]) -> dict[str, Any]:
-    return {state: targets[state].slip_ratio for state in DRIVE_STATES} | {
-        "entry": targets["traction"].terrain,
-        "status": ", ".join(dict.fromkeys(targets[state].status for state in DRIVE_STATES)),
-        "source": "; ".join(dict.fromkeys(targets[state].source for state in DRIVE_STATES)),
-    }
 
 
 def report(result: Predictions) -> Report:

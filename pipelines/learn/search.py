@@ -84,7 +84,11 @@ def search(
     LogError
         if the folder is damaged.
     """
-    optuna = _optuna()
+    try:
+        import optuna
+    except ModuleNotFoundError as error:
+        raise ConfigError("--search needs optuna: pip install 'terrain-slip[sweep]'") from error
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
     samples = data.samples
     examples = Examples(data.features, samples.terrain, samples.group)
     outer = folds_of(samples, "grouped", 1, seed)[0]
@@ -104,21 +108,16 @@ def search(
         lines = "".join(json.dumps(as_json(trial)) + "\n" for trial in trials)
         atomic_write(folder / TRIALS_FILE, lines)
     best = max(trials[:n_trials], key=lambda trial: trial.accuracy)
-    held_out = _held_out(examples, outer, best.params, samples.gap, seed)
+    default, found = (  # on runs that no trial has seen
+        Outcome.of(evaluate(GroupedSVC(of, gap=samples.gap, seed=seed), examples, [outer]), examples.group)
+        for of in (CANDIDATES, (best.params,))
+    )
+    held_out = compare_outcomes(default, found, np.random.default_rng(seed)).accuracy
     runs = tuple(np.unique(samples.group[outer.test].astype(str)).tolist())
-    found = SearchResult(len(trials), resumed, best, held_out, runs, folder / BEST_FILE)
+    result = SearchResult(len(trials), resumed, best, held_out, runs, folder / BEST_FILE)
     document = {"version": VERSION, "data_digest": data.digest, "held_out": held_out, **best._asdict()}
-    atomic_write(found.params_file, json.dumps(as_json(document), indent=2) + "\n")
-    return found
-
-
-def _optuna() -> Any:
-    try:
-        import optuna
-    except ModuleNotFoundError as error:
-        raise ConfigError("--search needs optuna: pip install 'terrain-slip[sweep]'") from error
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    return optuna
+    atomic_write(result.params_file, json.dumps(as_json(document), indent=2) + "\n")
+    return result
 
 
 def _begin(folder: Path, text: str) -> list[Trial]:
@@ -172,12 +171,3 @@ def _tried(examples: Examples, gap: int, seed: int, params: Candidate) -> Trial:
     hits, sizes = np.bincount(place, weights=correct), np.bincount(place)
     draws = (weights @ hits / (weights @ sizes))[1:]
     return Trial(params, float(correct.mean()), percentile_interval(draws))
-
-
-def _held_out(examples: Examples, outer: Fold, best: Candidate, gap: int, seed: int) -> Difference:
-    """Return the accuracy of the default choice and of the best candidate on runs that no trial has seen."""
-    default, found = (
-        Outcome.of(evaluate(GroupedSVC(each, gap=gap, seed=seed), examples, [outer]), examples.group)
-        for each in (CANDIDATES, (best,))
-    )
-    return compare_outcomes(default, found, np.random.default_rng(seed)).accuracy

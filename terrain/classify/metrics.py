@@ -657,33 +657,20 @@ class SequenceFigures(NamedTuple):
     single_accuracy_ci: Interval
     gain: float  #: filtered minus single, paired
     gain_ci: Interval
-    #: filtered_accuracy_at_end, single_accuracy_at_end: the same over all time, where windows across a change are
-    #: judged by the terrain at their end
-    filtered_accuracy_at_end: float
-    filtered_accuracy_at_end_ci: Interval
-    single_accuracy_at_end: float
-    single_accuracy_at_end_ci: Interval
     filter_delay_s: DelayFigures  #: from a change to its report
     #: flips_per_minute, single_flips_per_minute: changes of the reported terrain, less the true ones
     flips_per_minute: float
-    flips_per_minute_ci: Interval
     single_flips_per_minute: float
-    single_flips_per_minute_ci: Interval
     unknown_ratio: float  #: fraction of the time at which "unknown" was reported
-    n_courses: int  #: n_courses, n_grounds, duration_s: sequences, stretches on one terrain, and time
-    n_grounds: int
-    duration_s: float
+    n_courses: int  #: sequences
 
 
 #: Of a stretch on one terrain; flips are changes of the reported terrain less the true one.
-COUNTS = (
-    *("whole", "filtered", "single", "all", "filtered_all"),
-    *("single_all", "unknown", "flips", "single_flips"),
-)
+COUNTS = ("whole", "filtered", "single", "all", "unknown", "flips", "single_flips")
 
 
 class Track(NamedTuple):
-    """What was reported along a sequence: counts (m, 9) of every stretch on one terrain, its terrain and run (m,).
+    """What was reported along a sequence: counts (m, 7) of every stretch on one terrain, its terrain and run (m,).
 
     ``delay_s`` (m,) is of the change to it: NaN where the terrain did not change before, and infinite where that was
     never found.
@@ -726,7 +713,7 @@ def track_of(
         whole = here & (starts_s >= label.start_s - TIME_TOLERANCE_S)
         right = [(reports == terrain[i]) & here for reports in (filtered, single)]
         changed = i > 0 and bool(terrain[i - 1] != terrain[i])
-        parts = [whole, *(each & whole for each in right), here, *right, here & (filtered < 0)]
+        parts = [whole, *(each & whole for each in right), here, here & (filtered < 0)]
         counts[i] = [*(np.sum(part) for part in parts), *(np.sum(flip & here) - changed for flip in flips)]
         if changed:
             at = np.flatnonzero(right[0])
@@ -753,9 +740,8 @@ def sequence_figures(tracks: Sequence[Track], seed: int) -> SequenceFigures | No
     draws = weights[:, place]
     drawn = dict(zip(COUNTS, (draws @ counts).T, strict=True))
 
-    def ratio(above: str, below: str, minus: str = "", per: float = 1.0) -> tuple[float, Interval]:
-        less = drawn[minus] if minus else 0.0
-        value, interval = ratio_over_runs((drawn[above] - less) * per, drawn[below])
+    def ratio(numerator: Array, below: str = "all") -> tuple[float, Interval]:
+        value, interval = ratio_over_runs(numerator, drawn[below])
         return math.nan if value is None else value, interval or NO_INTERVAL
 
     changes, found = delay_s[~np.isnan(delay_s)], np.flatnonzero(np.isfinite(delay_s))
@@ -772,19 +758,16 @@ def sequence_figures(tracks: Sequence[Track], seed: int) -> SequenceFigures | No
     of_all = float(np.quantile(changes, 0.9, method="inverted_cdf")) if len(found) else math.inf
     known = of_all if math.isfinite(of_all) else None
     n_missed, a_minute = len(changes) - len(found), 60.0 / STRIDE_S
+    filtered, single = drawn["filtered"], drawn["single"]
     return SequenceFigures(
-        *ratio("filtered", "whole"),
-        *ratio("single", "whole"),
-        *ratio("filtered", "whole", "single"),
-        *ratio("filtered_all", "all"),
-        *ratio("single_all", "all"),
+        *ratio(filtered, "whole"),
+        *ratio(single, "whole"),
+        *ratio(filtered - single, "whole"),
         DelayFigures(*quantile(0.5), *quantile(0.9), len(changes), n_missed, known),
-        *ratio("flips", "all", per=a_minute),
-        *ratio("single_flips", "all", per=a_minute),
-        unknown_ratio=ratio("unknown", "all")[0],
-        n_courses=len(tracks),
-        n_grounds=len(run),
-        duration_s=float(drawn["all"][0] * STRIDE_S),
+        ratio(drawn["flips"] * a_minute)[0],
+        ratio(drawn["single_flips"] * a_minute)[0],
+        ratio(drawn["unknown"])[0],
+        len(tracks),
     )
 
 

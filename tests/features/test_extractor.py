@@ -77,17 +77,6 @@ def test_one_by_one_is_all_at_once_and_the_order_of_channels_is_no_matter():
     np.testing.assert_array_equal(extractor.transform(turned), together)
 
 
-def test_slip_that_is_unknown_makes_slip_features_unknown_and_no_other():
-    windows = draw_windows()
-    windows.values["slip"][3] = np.nan
-    extractor = FeatureExtractor().fit(windows)
-    unknown = np.isnan(extractor.transform(windows))
-    of_slip = np.array([feature.sets == {"slip"} for feature in extractor.features_])
-    assert unknown[3, of_slip].all()
-    unknown[3, of_slip] = False
-    assert not unknown.any()
-
-
 def test_windows_of_another_kind_and_sets_without_a_channel_are_refused():
     windows = draw_windows()
     extractor, few = FeatureExtractor().fit(windows), draw_windows(streams=("imu", "wheels", "estimator"))

@@ -84,13 +84,7 @@ def test_labels_are_removed_in_an_interval_and_a_whole_run_is_labelled_to_its_la
     labelled(folder, whole=True, terrain="ICE")
     assert labels_of(folder) == [(0.0, pytest.approx(4.0), "ICE")]
 
-
-def test_places_without_runs_and_two_runs_of_one_id_are_refused(folder, tmp_path):
-    with pytest.raises(LogError, match="does not exist"):
-        found(tmp_path / "nowhere")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(LogError, match="holds no run folder"):
-        found(tmp_path / "empty")
+    # Two runs of one id are refused.
     (folder / "SNOW_01").rename(folder / "other")
     head = (folder / "SNOW_02" / "run.json").read_text()
     (folder / "SNOW_02" / "run.json").write_text(head.replace("SNOW_02", "SNOW_01"))

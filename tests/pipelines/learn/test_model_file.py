@@ -21,7 +21,6 @@ from pipelines.learn.model_file import (
     read_model,
     seal,
     skops_io,
-    write_model,
 )
 from terrain.errors import ModelError
 
@@ -182,14 +181,3 @@ def test_a_file_that_is_missing_or_a_link_out_of_the_folder_is_refused(model_dir
     (tmp_path / name).rename(model_dir / name)
     (tmp_path / "link").symlink_to(model_dir)
     read_model(tmp_path / "link")
-
-
-class Foreign(LogisticRegression):
-    """Of no library."""
-
-
-def test_an_estimator_of_ones_own_is_refused_before_it_is_stored(model, tmp_path):
-    own = WindowPipeline([*model.recipe.steps[:-1], ("classifier", Foreign())])
-    with pytest.raises(ModelError, match="Foreign cannot be stored: a model file holds only types"):
-        write_model(tmp_path, model._replace(recipe=own))
-    assert not list(tmp_path.glob("*.*"))

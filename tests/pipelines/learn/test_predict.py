@@ -10,7 +10,7 @@ from pipelines.learn.predict import NOT_LEARNED, Settings, predict, run
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.training_data import fitted_model
 from pipelines.report.results import as_json
-from terrain.control.slip_table import DRIVE_STATES, SlipTable, load_slip_table
+from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.logs.run_folders import write_run
 from terrain.records import RunLog, Stream
@@ -63,7 +63,13 @@ def test_a_model_of_some_signals_needs_no_others_and_names_its_training_runs(run
 
 def test_labels_that_were_not_trained_are_predicted_counted_and_not_judged(model, drive, drive_all):
     known = drive_all(n_runs=1, seed=5)
-    alone = predict(known, model, TABLE)
+    targets = {name: TABLE.targets[name] for name in ("unknown", "ASPHALT")}
+    alone = predict(known, model, SlipTable("bare", "unknown", targets))
+    entries = {(row.terrain, row.slip_entry) for row in alone.windows}  # without one of its own, the fallback
+    assert entries == {("ASPHALT", "ASPHALT"), ("GRASS", "unknown"), ("GRAVEL", "unknown")}
+    for row in alone.windows:
+        target = targets[row.slip_entry]["braking"]
+        assert (row.target_slip["braking"], row.status["braking"]) == (target.slip_ratio, target.status)
     strange = [
         drive("lava_1", "GRASS", 8, label="LAVA"),
         drive("tar_1", "GRAVEL", 9, label="TAR", duration_s=10.0),
@@ -77,17 +83,6 @@ def test_labels_that_were_not_trained_are_predicted_counted_and_not_judged(model
         only = predict(runs, model, TABLE)
         assert (only.accuracy, only.n_judged) == (None, 0)
         assert {row.label for row in only.windows} == labels
-
-
-def test_a_terrain_without_an_entry_gets_the_named_fallback(model, drive_all):
-    targets = {name: TABLE.targets[name] for name in ("unknown", "ASPHALT")}
-    result = predict(drive_all(n_runs=1, seed=5), model, SlipTable("bare", "unknown", targets))
-    entries = {(row.terrain, row.slip_entry) for row in result.windows}
-    assert entries == {("ASPHALT", "ASPHALT"), ("GRASS", "unknown"), ("GRAVEL", "unknown")}
-    for row in result.windows:
-        for state in DRIVE_STATES:
-            target = targets[row.slip_entry][state]
-            assert (row.target_slip[state], row.status[state]) == (target.slip_ratio, target.status)
 
 
 def test_windows_that_are_dropped_are_counted_and_the_others_do_not_change(model, drive):

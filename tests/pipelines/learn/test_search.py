@@ -99,7 +99,6 @@ def test_parameters_that_are_none_are_refused(tmp_path):
         ("{", "no result of a search"),
         ({"version": 9, "params": BEST}, "version: Input should be 1"),
         ({"version": 1, "params": BEST | {"depth": 3}}, "params.depth: Extra inputs"),
-        ({"version": 1, "params": {"C": 1, "gamma": 1}}, "params.percentile: Field required"),
         ({"version": 1, "params": BEST | {"C": -1}}, "params.C: Input should be greater"),
         ({"version": 1, "params": BEST | {"percentile": 500}}, "params.percentile: Input should be less"),
     ):

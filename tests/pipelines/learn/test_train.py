@@ -1,10 +1,7 @@
 """Training: evaluated on held-out runs, tracked with its card, and kept where the tracking server stops."""
 
 import json
-import signal
 import socket
-import subprocess
-import sys
 import time
 from dataclasses import replace
 
@@ -16,7 +13,7 @@ from features.motion import window_motion
 from features.protocols import samples_of
 from pipelines.learn import tracking
 from pipelines.learn.card import limits_of, model_result, read_training
-from pipelines.learn.model_file import CARD_FILE, TRAINING_FILE, read_model, seal
+from pipelines.learn.model_file import CARD_FILE, TRAINING_FILE, seal
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.train import Settings, run
 from pipelines.report.results import as_json
@@ -108,67 +105,37 @@ def test_a_record_of_a_training_that_is_none_is_one_sentence(in_tracked, model_d
         run(Settings(kept=model_dir, name="m"))
 
 
-SERVER = """
-import sys, uvicorn, os
-os.environ["_MLFLOW_SERVER_FILE_STORE"] = os.environ["_MLFLOW_SERVER_REGISTRY_STORE"] = sys.argv[2]
-os.environ["_MLFLOW_SERVER_ARTIFACT_ROOT"] = "mlflow-artifacts:/"
-os.environ["_MLFLOW_SERVER_ARTIFACT_DESTINATION"] = sys.argv[3]
-os.environ["_MLFLOW_SERVER_SERVE_ARTIFACTS"] = "true"
-from mlflow.server.fastapi_app import app
-uvicorn.run(app, host="127.0.0.1", port=int(sys.argv[1]), log_level="critical")
-"""
+def test_a_store_that_fails_in_the_middle_costs_no_model(runs, tracked, tmp_path, monkeypatch):
+    for each in runs:
+        write_run(each, tmp_path / "runs")
+    monkeypatch.chdir(tracked[0])
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
 
+    def failing(*given):
+        raise OSError("the server has stopped")
 
-@pytest.fixture
-def server(tmp_path, monkeypatch):
-    """A tracking server in a process of its own, which the environment names."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    words = [str(port), f"sqlite:///{tmp_path / 'server.db'}", str(tmp_path / "artifacts")]
-    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    process = subprocess.Popen([sys.executable, "-c", SERVER, *words], cwd=tmp_path, **silent)
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"http://127.0.0.1:{port}")
-    end_s = time.monotonic() + 120
-    while time.monotonic() < end_s:
-        try:
-            socket.create_connection(("127.0.0.1", port), timeout=1).close()
-            break
-        except OSError:
-            time.sleep(0.2)
-    yield process
-    process.send_signal(signal.SIGCONT)
-    process.kill()
-    process.wait()
+    usual = tracking._log_model
+    monkeypatch.setattr(tracking, "_log_model", failing)
+    sentence = (
+        r"has stopped; the model is kept in .*: register it by terrain train --register .*/kept --name field"
+    )
+    with pytest.raises(TerrainError, match=sentence) as error:
+        run(Settings(data=tmp_path / "runs", name="field", out=tmp_path / "kept", repeats=1, n_jobs=1))
+    assert len(str(error.value).splitlines()) == 1
+    monkeypatch.setattr(tracking, "_log_model", usual)
+    asked = Settings(kept=tmp_path / "kept", name="kept")
+    found, again = run(asked), run(asked)
+    assert (found.model_uri, found.alias_moved) == ("models:/kept/1", True)
+    assert not again.alias_moved
+    assert "is not better than" in again.alias_reason
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stop", [signal.SIGSTOP, signal.SIGKILL])
-def test_a_server_that_stops_in_the_middle_costs_seconds_and_no_model(
-    server, runs, tracked, tmp_path, monkeypatch, stop
-):
-    for each in runs:
-        write_run(each, tmp_path / "runs")
-    monkeypatch.chdir(tmp_path)
-    stopped_s, usual = [], tracking._log_model
-
-    def stopping(*given):
-        server.send_signal(stop)
-        stopped_s.append(time.monotonic())
-        return usual(*given)
-
-    monkeypatch.setattr(tracking, "_log_model", stopping)
-    sentence = r"register it by terrain train --register field-not-registered"
-    with pytest.raises(TerrainError, match=sentence) as error:
-        run(Settings(data=tmp_path / "runs", name="field", repeats=1, n_jobs=1))
-    assert time.monotonic() - stopped_s[0] < 30.0
+def test_a_server_that_hangs_costs_seconds(model_dir, monkeypatch):
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # takes calls, and never answers
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", f"http://127.0.0.1:{silent.getsockname()[1]}")
+        begun_s = time.monotonic()
+        with pytest.raises(TerrainError, match="MLflow: ") as error:
+            run(Settings(kept=model_dir, name="field"))
+    assert time.monotonic() - begun_s < 30.0
     assert len(str(error.value).splitlines()) == 1
-    asked = Settings(kept=tmp_path / "field-not-registered", name=f"kept_{stop.name}")
-    assert read_model(asked.kept).info.classes == ("ASPHALT", "GRASS", "GRAVEL")
-    monkeypatch.setattr(tracking, "_log_model", usual)
-    monkeypatch.delenv("MLFLOW_TRACKING_URI")
-    monkeypatch.chdir(tracked[0])
-    found, again = run(asked), run(asked)
-    assert (found.model_uri, found.alias_moved) == (f"models:/{asked.name}/1", True)
-    assert not again.alias_moved
-    assert "is not better than" in again.alias_reason

@@ -79,15 +79,6 @@ def test_different_seeds_give_different_folds_though_runs_are_of_unequal_length(
     assert together_ratio.max() < 0.6  # no two runs always meet
 
 
-def test_too_few_classes_or_runs_for_folds_are_refused():
-    rng = np.random.default_rng(0)
-    with pytest.raises(DataError, match="all windows are 'ice': a classifier needs at least two classes"):
-        next(split_runs(np.array(["ice"] * 4), np.array(list("aabb")), 2, rng))
-    y, groups = np.repeat(["ice", "ice", "snow", "snow"], 3), np.repeat(list("abcd"), 3)
-    with pytest.raises(DataError, match="4 runs are fewer than 5 folds"):
-        next(split_runs(y, groups, 5, rng))
-
-
 def test_enough_is_left_of_every_terrain(make_run):
     for counts, held_out in (
         ({"ice": 6, "mud": 7, "sand": 2}, ["ice_5", "mud_6"]),
