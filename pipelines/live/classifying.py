@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from features.stream import WindowFeed
-from pipelines.live.model import ModelInfo, TerrainModel, assess
+from pipelines.live.model import TerrainModel, assess
 from pipelines.live.windows import feed_of
 from terrain.classify.terrain_filter import LiveTerrainFilter
 from terrain.control.switching import UNKNOWN, TerrainEstimate, TerrainSource
@@ -51,11 +51,6 @@ class WindowOutput(NamedTuple):
     novelty: float = math.nan
     #: whether training runs that drove like this support the class; None where not counted
     supported: bool | None = None
-
-    @property
-    def unknown(self) -> bool:
-        """Whether the window is like no terrain that was learned."""
-        return not self.refused and not self.terrain
 
 
 def classify_window(model: TerrainModel, window: Windows) -> WindowOutput:
@@ -152,9 +147,9 @@ class Classifier(TerrainSource):
 
     def check(self, model: TerrainModel | None) -> None:
         """Raise ``DataError`` where a model cannot replace this one, or is none."""
-        if model is not None and not self._suits(model.info):
-            self._feed_of(model)
-        if model is None and self.model is not None:
+        if model is not None:
+            self._feed_for(model)
+        elif self.model is not None:
             raise DataError("a model cannot be replaced by none")
 
     def swap(self, model: TerrainModel | None) -> None:
@@ -165,19 +160,21 @@ class Classifier(TerrainSource):
         """
         self.check(model)
         if model is not None:
-            self._begin(model, self._feed if self._suits(model.info) else self._feed_of(model))
+            self._begin(model, self._feed_for(model))
 
     def restart(self) -> None:
         """Cut windows anew from the next sample on."""
         if self.model is not None:
             self._begin(self.model, self._feed_of(self.model))
 
-    def _suits(self, info: ModelInfo) -> bool:
-        """Say whether another model takes the same windows."""
-        return self.model is not None and all(
-            getattr(info, name) == getattr(self.model.info, name)
-            for name in ("channels", "rate_hz", "rule", "filter")
-        )
+    def _feed_for(self, model: TerrainModel) -> WindowFeed:
+        """Return what cuts the windows of another model: what cuts them now, where both take the same windows."""
+        same = ("channels", "rate_hz", "rule", "filter")
+        if self.model is not None and all(
+            getattr(model.info, n) == getattr(self.model.info, n) for n in same
+        ):
+            return self._feed
+        return self._feed_of(model)
 
     def _begin(self, model: TerrainModel, feed: WindowFeed) -> None:
         self.model, self._feed = model, feed
@@ -207,23 +204,23 @@ class Classifier(TerrainSource):
             return []
         self._waiting.append((readings, estimates))
         n = len(self._waiting)
-        if n > MAX_WAITING:
-            self._leave_out()
-        if self._thread is None or n % AT_MOST == 0 or _newest_s(readings, estimates) >= self._due_s:
+        if n > MAX_WAITING:  # the oldest step is left out; a model that waits before it is taken first
+            with suppress(IndexError):  # the thread has just taken it
+                oldest = self._waiting.popleft()
+                if isinstance(oldest, _Part):
+                    self._waiting.appendleft(oldest)
+                else:
+                    self._lost["steps: overrun"] += 1
+        stamps = [last_stamp_s(readings, stream) for stream in readings] + [
+            one.time_s for one in estimates[-1:]
+        ]
+        # False for NaN, of a stream without a stamp
+        if self._thread is None or n % AT_MOST == 0 or any(stamp_s >= self._due_s for stamp_s in stamps):
             self._do_what_waits()
         self.outputs = outputs = [self._finished.popleft() for _ in range(len(self._finished))]
         self.failed.update(output.refused for output in outputs if output.refused)
         self.n_refused = self.failed.total()
         return outputs
-
-    def _leave_out(self) -> None:
-        """Remove the oldest step that waits; a model that waits before it is taken first."""
-        with suppress(IndexError):  # the thread has just taken it
-            oldest = self._waiting.popleft()
-            if isinstance(oldest, _Part):
-                self._waiting.appendleft(oldest)
-            else:
-                self._lost["steps: overrun"] += 1
 
     def _work(self) -> None:
         """Cut and classify what waits."""
@@ -248,16 +245,14 @@ class Classifier(TerrainSource):
             terrain, probability = output.terrain, output.probability
             if self._over_time is not None:
                 classes, probabilities = zip(*output.probabilities.items(), strict=True)
-                window = output.end_s, np.array(probabilities), output.novelty, output.unknown
-                best, probability = self._over_time.take(*window)
+                unknown = (
+                    not output.refused and not output.terrain
+                )  # the window is like none that was learned
+                best, probability = self._over_time.take(
+                    output.end_s, np.array(probabilities), output.novelty, unknown
+                )
                 terrain = classes[best] if best >= 0 else UNKNOWN
             elif output.refused:
                 continue
             found.append(TerrainEstimate(output.end_s, terrain, probability))
         return found
-
-
-def _newest_s(readings: Mapping[str, Reading], estimates: Sequence[Estimate]) -> float:
-    """Return the newest stamp; minus infinity where there is none."""
-    stamps = [last_stamp_s(readings, stream) for stream in readings] + [one.time_s for one in estimates[-1:]]
-    return max((stamp_s for stamp_s in stamps if not math.isnan(stamp_s)), default=-math.inf)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -131,7 +132,14 @@ class Observer(Chain):
         stamps = [stamp_s for stream in samples if math.isfinite(stamp_s := last_stamp_s(samples, stream))]
         newest_s = max(stamps, default=math.nan)
         if "wheels" in samples and self._speed_columns:
-            self._speed_mps, self._speed_s = self._wheel_speed_mps(samples["wheels"]), newest_s
+            self._speed_mps, self._speed_s = (
+                math.inf,
+                newest_s,
+            )  # of the fastest wheel; infinite where it is unknown
+            with suppress(TypeError, ValueError, LookupError, AttributeError, OverflowError):
+                speeds = np.abs(np.asarray(samples["wheels"].values, dtype=float)[-1, self._speed_columns])
+                if not np.isnan(speeds).all():
+                    self._speed_mps = float(np.nanmax(speeds)) * self._mps_per_unit
         if math.isnan(now_s):
             now_s = newest_s
         dt_s = now_s - self._now_s
@@ -140,11 +148,3 @@ class Observer(Chain):
         if dt_s > 0.0:  # False for NaN
             seen = now_s - self._speed_s <= LONGEST_STEP_S
             self.belief = drive_on(self.belief, self._speed_mps if seen else math.inf, dt_s, self.switching)
-
-    def _wheel_speed_mps(self, reading: Reading) -> float:
-        """Return the speed of the fastest wheel; infinite where it is unknown."""
-        try:
-            speeds = np.abs(np.asarray(reading.values, dtype=float)[-1, self._speed_columns])
-        except (TypeError, ValueError, LookupError, AttributeError, OverflowError):
-            return math.inf
-        return math.inf if np.isnan(speeds).all() else float(np.nanmax(speeds)) * self._mps_per_unit

@@ -35,7 +35,7 @@ from terrain.estimation.feed import places_among
 from terrain.estimation.health import SENSORS, Health
 from terrain.estimation.live import CHANNELS, LiveEstimate, LiveFilter
 from terrain.extension import correct_live
-from terrain.records import Array, Command, Reading, Sample
+from terrain.records import Command, Sample
 from terrain.robots import Robot
 
 
@@ -121,12 +121,17 @@ class LivePilot(Chain):
 
     def take(self, sample: Sample) -> Step:
         """Return the command for a sample: to stand, where nothing is known yet or the step fails."""
-        readings = {
-            name: reading._replace(values=_ordered(reading.values, self._columns[name]))
-            for name, reading in sample.readings.items()
-            if name in self._columns
-        }
-        if math.isnan(sample.time_s) or not self._is_steered(readings):
+        readings = {name: reading for name, reading in sample.readings.items() if name in self._columns}
+        for name, reading in readings.items():
+            if (places := self._columns[name]) is not None:  # NaN where a channel is not sent, at place -1
+                given = np.column_stack([reading.values, np.full(len(reading.values), math.nan)])
+                readings[name] = reading._replace(values=given[:, places])
+        if self._awaits_steering and "steering" in readings and len(readings["steering"].values):
+            measured_rad = readings["steering"].values[-1]
+            if np.isfinite(measured_rad).all():
+                self._standing_rad = self.control.steer_rad = measured_rad - self._steering_zeros_rad
+                self._awaits_steering = False
+        if math.isnan(sample.time_s) or self._awaits_steering:
             return Step((), self._standing(), CommandStatus.NO_SAMPLES)
         try:
             command = self.step(sample._replace(readings=readings))
@@ -139,15 +144,6 @@ class LivePilot(Chain):
             command, status = self._standing()._replace(status=command.status), CommandStatus.NOT_FINITE
         self._standing_rad = command.steer_rad
         return Step(windows, command, status)
-
-    def _is_steered(self, readings: Mapping[str, Reading]) -> bool:
-        """Begin with the steering where it stands; return whether that is known, where it is measured."""
-        if self._awaits_steering and "steering" in readings and len(readings["steering"].values):
-            measured_rad = readings["steering"].values[-1]
-            if np.isfinite(measured_rad).all():
-                self._standing_rad = self.control.steer_rad = measured_rad - self._steering_zeros_rad
-                self._awaits_steering = False
-        return not self._awaits_steering
 
     def _standing(self) -> Command:
         """Return the command to stand, steered as before."""
@@ -185,10 +181,3 @@ class LivePilot(Chain):
             time_s, dt_s, desired, self.estimate, self.belief, output, holds=self.source.certain
         )
         return command
-
-
-def _ordered(values: Array, places: Array | None) -> Array:
-    """Return columns in the order of the schema, NaN where a channel is not sent, at place -1."""
-    if places is None:
-        return values
-    return np.column_stack([values, np.full(len(values), math.nan)])[:, places]

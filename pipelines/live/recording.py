@@ -172,7 +172,12 @@ class SessionRecorder:
             if ended and not self.files and self._ended == FINISHED:
                 self._ended = NOTHING_KEPT
         except OSError as error:
-            ended, self._ended = True, f"stopped: {_reason(error)}"
+            ended, reason = True, f"cannot be written ({error.strerror or error})"
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                reason = "no space left on the disk"
+            elif isinstance(error, FileNotFoundError):
+                reason = "the folder was removed"
+            self._ended = f"stopped: {reason}"
         except Exception as error:  # of this recording: the thread serves the others
             ended, self._ended = True, f"stopped: {type(error).__name__}: {error}"
         if ended:
@@ -200,7 +205,9 @@ class SessionRecorder:
                 self._run.append(name, self._channels[name], rows[:, 0], rows[:, 1:])
         for output in windows:
             if 0.0 <= output.end_s - self._origin_s < LATEST_S:
-                self._run.append_text(WINDOW_TOPIC, output.end_s, recorded(output).model_dump_json())
+                accepted = output.terrain and output.probability >= SWITCHING.probability_least
+                window = RecordedWindow(**output._asdict(), doubtful=not accepted)
+                self._run.append_text(WINDOW_TOPIC, output.end_s, window.model_dump_json())
         self._run.flush()
         os.fsync(file.fileno())
         if not os.fstat(file.fileno()).st_nlink:
@@ -233,21 +240,6 @@ class SessionRecorder:
         self._run = RunRecorder(McapWriter(file, head), head, self._origin_s)
         self.files.append(path)
         return file
-
-
-def recorded(output: WindowOutput) -> RecordedWindow:
-    """Return what is recorded of a model's output for a window."""
-    accepted = output.terrain and output.probability >= SWITCHING.probability_least
-    return RecordedWindow(**output._asdict(), doubtful=not accepted)
-
-
-def _reason(error: OSError) -> str:
-    """Return in words why nothing could be written."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return "no space left on the disk"
-    if isinstance(error, FileNotFoundError):
-        return "the folder was removed"
-    return f"cannot be written ({error.strerror or error})"
 
 
 class RecordingThread:

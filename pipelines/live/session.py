@@ -289,7 +289,12 @@ class RobotSession:
         twist = self._twist if fresh else _NO_TWIST
         done = self.chain.take(Sample(time_s, twist, readings))
         self._n_steps += 1
-        self._judge_late(now_s, bool(done.windows))
+        if done.windows or self.served.model is None or math.isnan(self._window_s):
+            self._window_s = now_s
+        if (too_late := self.chain.too_late) != self._too_late:
+            self._too_late, self._too_late_s = too_late, now_s
+        is_late = now_s - self._window_s > LATE_SHOWN_S > now_s - self._too_late_s
+        self.late = f"no terrain: samples come late by {1e3 * too_late[1]:.0f} ms" if is_late else ""
         if done.windows:
             found = {name: getattr(done.windows[-1], name) for name in WINDOW}
             self._window = {name: None if value == "" else value for name, value in found.items()}
@@ -306,15 +311,6 @@ class RobotSession:
             latency_s=now_s - self._sampled_s + (monotonic() - begun_s),
         )
         return self.last
-
-    def _judge_late(self, now_s: float, has_window: bool) -> None:
-        """Say whether samples come so late that no window is whole."""
-        if has_window or self.served.model is None or math.isnan(self._window_s):
-            self._window_s = now_s
-        if (too_late := self.chain.too_late) != self._too_late:
-            self._too_late, self._too_late_s = too_late, now_s
-        is_late = now_s - self._window_s > LATE_SHOWN_S > now_s - self._too_late_s
-        self.late = f"no terrain: samples come late by {1e3 * self._too_late[1]:.0f} ms" if is_late else ""
 
     def _observation(self, time_s: float) -> dict[str, Any]:
         belief, seen = self.chain.belief, self.chain.estimate

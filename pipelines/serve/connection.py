@@ -38,6 +38,14 @@ TRY_AGAIN_LATER, POLICY = 1013, 1008  #: Codes of closed WebSockets (RFC 6455)
 
 NO_TOKEN = "a token is required, or it is another"
 
+BUDGETS = {
+    "messages": "messages_per_s",
+    "rows": "rows_per_s",
+    "bytes": "bytes_per_s",
+    "s of decoding": "decoding_s_per_s",
+}
+"""What one session may spend a second, by what it is called; each is one of the hub's limits."""
+
 GONE = (WebSocketDisconnect, RuntimeError, OSError)
 """What is raised where the other end has left, in the middle of anything; ``TimeoutError`` is among them."""
 
@@ -83,7 +91,9 @@ class Connection:
         self._socket, self._hub = socket, hub
         self._packed = False
         self._end: tuple[int, str] = (1000, "")
-        self._budgets = Budgets(hub.limits.per_s)
+        limits = hub.limits._asdict()
+        self._limits = {name: limits[name] for name in limits if name != "sessions"}
+        self._budgets = Budgets({words: limits[name] for words, name in BUDGETS.items()})
         self._notes: deque[dict[str, Any]] = deque(maxlen=MAX_NOTES)
         self._step: Step | None = None
         self._changed = asyncio.Event()
@@ -171,9 +181,7 @@ class Connection:
     async def _talk(self) -> None:
         """Receive, step and send at once; each of them ends all by what it raises."""
         try:
-            limits = self._hub.limits._asdict()
-            del limits["sessions"]
-            await self._write(self._session.welcome() | {"limits": limits})
+            await self._write(self._session.welcome() | {"limits": self._limits})
             async with asyncio.TaskGroup() as talking:
                 talking.create_task(self._receive())
                 talking.create_task(self._send())
@@ -200,10 +208,12 @@ class Connection:
                     await asyncio.sleep(0)
                 owed_s, most = self._budgets.owed(now_s)
                 if owed_s > 0.0:
-                    self._drop(most)
+                    if not self._dropped:  # those of a twentieth of a second are named in one error
+                        asyncio.get_running_loop().call_later(0.05, self._note_dropped)
+                    self._dropped[most] += 1
                     await asyncio.sleep(owed_s)
                     continue
-                content = await self._decoded(message)
+                content = await self._decode(message)
                 kind = str(content.get("type"))
                 if kind == "bye":
                     raise WebSocketDisconnect
@@ -216,7 +226,7 @@ class Connection:
             except WireError as error:
                 self._note(error.code, str(error))
 
-    async def _decoded(self, message: str | bytes) -> dict[str, Any]:
+    async def _decode(self, message: str | bytes) -> dict[str, Any]:
         most, begun_s = self._hub.limits.message_bytes, monotonic()
         self._budgets.spend(begun_s, messages=1, bytes=len(message))
         if len(message) > most:
@@ -261,7 +271,13 @@ class Connection:
             metrics.stopped.labels(output.status.value).inc()
         if output.status is CommandStatus.FAILED:
             self._hub.trouble[f"session {self._session.hello.session}"] = output.failure
-        self._show_late()
+        # named in the hub's trouble, and in the log once
+        name, late = self._session.hello.session, self._session.late
+        if late and f"late samples of {name}" not in self._hub.trouble:
+            print(f"{name}: {late}", file=sys.stderr, flush=True)
+        self._hub.trouble.pop(f"late samples of {name}", None)
+        if late:
+            self._hub.trouble[f"late samples of {name}"] = late
         for window in output.windows:
             metrics.window_s.observe(window.took_s)
             metrics.windows.labels(window.terrain or "refused").inc()
@@ -269,16 +285,6 @@ class Connection:
             metrics.unsent.inc()
         self._step = output
         self._changed.set()
-
-    def _show_late(self) -> None:
-        """Name in the hub's trouble, and in the log once, that samples come too late for a terrain."""
-        late, name = self._session.late, f"late samples of {self._session.hello.session}"
-        if late and name not in self._hub.trouble:
-            print(f"{self._session.hello.session}: {late}", file=sys.stderr, flush=True)
-        if late:
-            self._hub.trouble[name] = late
-        else:
-            self._hub.trouble.pop(name, None)
 
     async def _send(self) -> None:
         """Send what is there, first the notes, then the newest step; end with a fatal note."""
@@ -298,12 +304,6 @@ class Connection:
                 self._end = (TRY_AGAIN_LATER, "the receiver did not read for too long")
                 self._hub.metrics.errors.labels("too-slow").inc()
                 raise
-
-    def _drop(self, most: str) -> None:
-        """Count a message that comes too fast; those of a twentieth of a second are named in one error."""
-        if not self._dropped:
-            asyncio.get_running_loop().call_later(0.05, self._note_dropped)
-        self._dropped[most] += 1
 
     def _note_dropped(self) -> None:
         for most, n in self._dropped.items():

@@ -52,12 +52,6 @@ class Limits(NamedTuple):
     hello_s: float = 10.0  #: to say hello
     too_slow_s: float = 5.0  #: for which a receiver may not read
 
-    @property
-    def per_s(self) -> dict[str, float]:
-        """What one session may spend a second, by what it is called."""
-        budgets = {"messages": self.messages_per_s, "rows": self.rows_per_s, "bytes": self.bytes_per_s}
-        return budgets | {"s of decoding": self.decoding_s_per_s}
-
 
 class Hub:
     """Sessions of robots on one model and table, all of it loaded and checked, and its code run once.
