@@ -36,7 +36,7 @@ import numpy as np
 
 from pipelines.cli import main as cli
 
-from .commands import CASES, Case, Step
+from .commands import CASES, Case
 
 EXPECTED = Path(__file__).with_name("expected")
 
@@ -55,7 +55,7 @@ def run_case(case: Case, folder: Path) -> dict[str, Any]:
         (folder / name).write_bytes(content)
     with working_in(folder):
         result: dict[str, Any] = {
-            "steps": {f"{i:02d}": _run_step(step, i, folder) for i, step in enumerate(case.steps)}
+            "steps": {f"{i:02d}": _run_step(words, i, folder) for i, words in enumerate(case.steps)}
         }
         if case.helps:
             result["help"] = {name or "terrain": _helped(name) for name in case.helps}
@@ -183,14 +183,14 @@ def _run(words: list[str]) -> Done:
     return Done(code, out.getvalue(), err.getvalue())
 
 
-def _run_step(step: Step, i: int, folder: Path) -> dict[str, Any]:
-    file = folder / f"step_{i:02d}.json"
-    options = [] if step.code else ["--json", file.name]
-    done = _run([*step.words.split(), *options])
-    result: dict[str, Any] = {"line": step.words, "code": done.code}
-    if done.code != step.code:
+def _run_step(words: str, i: int, folder: Path) -> dict[str, Any]:
+    file, line = folder / f"step_{i:02d}.json", words.removeprefix("! ")
+    code, options = (2, []) if line != words else (0, ["--json", file.name])
+    done = _run([*line.split(), *options])
+    result: dict[str, Any] = {"line": line, "code": done.code}
+    if done.code != code:
         result["stderr"] = done.err[-2000:]
-    elif step.code:
+    elif code:
         result["refusal"] = {
             "lines": len(done.err.splitlines()),
             "begins_with_error": done.err.startswith("error: "),

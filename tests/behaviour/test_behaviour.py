@@ -36,8 +36,7 @@ def test_a_case_reproduces_its_recorded_result(case, tmp_path):
 
 
 def test_every_command_has_a_case():
-    lines = [step.words for case in CASES for step in case.steps if step.code == 0]
-    assert {line.split()[0] for line in lines} == set(COMMANDS)
+    assert {words.split()[0] for case in CASES for words in case.steps} - {"!"} == set(COMMANDS)
     assert set(load_result("help")["help"]["terrain"]["commands"]) == set(COMMANDS)
 
 

@@ -17,26 +17,12 @@ from sklearn.svm import SVC
 from features.extractor import FeatureExtractor
 from features.motion import window_motion
 from features.recipes import make_recipe
-from features.stream import WindowStream
-from features.windows import WindowRule, cut_windows, layout_of
+from features.windows import cut_windows
 from pipelines.data.datasets import load_runs
 from pipelines.live.model import assess
 from terrain.classify.limits import learn_novelty, learn_support
-from terrain.records import RunLog, Stream
 
 N_COMPARED = 8  #: tsfel takes about a tenth of a second a window
-
-
-def synthetic_run(duration_s=60.0):
-    rng = np.random.default_rng(0)
-    streams = {}
-    for name, rate_hz, channels in (
-        ("imu", 100.0, [f"gyro_{a}_radps" for a in "xyz"] + [f"accel_{a}_mps2" for a in "xyz"]),
-        ("wheels", 6.5, ["speed_left_mps", "speed_right_mps", "current_left_a", "current_right_a"]),
-    ):
-        time_s = np.arange(0, duration_s, 1 / rate_hz)
-        streams[name] = Stream(time_s, rng.normal(0.5, 0.1, (time_s.size, len(channels))), tuple(channels))
-    return RunLog("noise", "husky", streams)
 
 
 @pytest.fixture(scope="module")
@@ -44,15 +30,13 @@ def borealtc_windows(datasets_dir):
     return cut_windows(load_runs(datasets_dir / "borealtc")).windows
 
 
-@pytest.fixture(params=["synthetic", "borealtc"])
-def compared(request):
-    """Windows to compare on, and the name of the group."""
-    if request.param == "synthetic":
-        windows = cut_windows([synthetic_run()]).windows
-    else:
-        windows = request.getfixturevalue("borealtc_windows")
-    rows = np.linspace(0, len(windows) - 1, N_COMPARED).astype(int)
-    return windows[rows], f"{N_COMPARED} windows, {request.param}"
+@pytest.fixture(scope="module")
+def compared(borealtc_windows):
+    """Windows to compare on."""
+    return borealtc_windows[np.linspace(0, len(borealtc_windows) - 1, N_COMPARED).astype(int)]
+
+
+COMPARED = pytest.mark.benchmark(group=f"{N_COMPARED} windows of borealtc")
 
 
 def warmed_up(windows):
@@ -67,28 +51,28 @@ def report(benchmark, n_windows, n_features):
         benchmark.extra_info["ms_per_window"] = 1e3 * benchmark.stats.stats.median / n_windows
 
 
+@COMPARED
 def test_transform_of_all_windows_at_once(benchmark, compared):
-    windows, benchmark.group = compared
-    table = benchmark(warmed_up(windows).transform, windows)
+    table = benchmark(warmed_up(compared).transform, compared)
     report(benchmark, *table.shape)
 
 
+@COMPARED
 def test_transform_of_windows_one_by_one(benchmark, compared):
-    windows, benchmark.group = compared
-    extractor = warmed_up(windows)
-    rows = benchmark(lambda: [extractor.transform(windows[i]) for i in range(len(windows))])
+    extractor = warmed_up(compared)
+    rows = benchmark(lambda: [extractor.transform(compared[i]) for i in range(len(compared))])
     report(benchmark, len(rows), rows[0].shape[1])
 
 
+@COMPARED
 @pytest.mark.filterwarnings("ignore:Precision loss occurred in moment calculation:RuntimeWarning")
 def test_tsfel_statistical_and_spectral(benchmark, compared):
-    windows, benchmark.group = compared
     domains = tsfel.get_features_by_domain()
     chosen = {name: domains[name] for name in ("statistical", "spectral")}
     arrays = [
-        (values[i].T, windows.rate_hz[name])
-        for name, values in windows.values.items()
-        for i in range(len(windows))
+        (values[i].T, compared.rate_hz[name])
+        for name, values in compared.values.items()
+        for i in range(len(compared))
     ]
 
     def extract():
@@ -98,7 +82,7 @@ def test_tsfel_statistical_and_spectral(benchmark, compared):
         ]
 
     tables = benchmark.pedantic(extract, rounds=3)
-    report(benchmark, len(windows), sum(table.shape[1] for table in tables) // len(windows))
+    report(benchmark, len(compared), sum(table.shape[1] for table in tables) // len(compared))
 
 
 @pytest.mark.benchmark(group="all windows of borealtc, bar 0.5 s")
@@ -106,25 +90,6 @@ def test_all_windows_of_borealtc(benchmark, borealtc_windows):
     table = benchmark(warmed_up(borealtc_windows).transform, borealtc_windows)
     report(benchmark, *table.shape)
     assert len(table) > 1600
-
-
-@pytest.mark.benchmark(group="one minute, sample by sample")
-def test_windows_of_a_minute_sample_by_sample(benchmark):
-    run = synthetic_run()
-    layout = layout_of([run])
-    samples = sorted(
-        (time_s, name, row.tolist())
-        for name, stream in run.streams.items()
-        for time_s, row in zip(stream.time_s.tolist(), stream.values, strict=True)
-    )
-
-    def cut():
-        stream = WindowStream(WindowRule(), layout)
-        return [window for time_s, name, row in samples for window in stream.push(name, time_s, row)]
-
-    found = benchmark(cut)
-    benchmark.extra_info["n_samples"] = len(samples)
-    assert len(found) == 30
 
 
 @pytest.mark.benchmark(group="one window, bar 2 ms")

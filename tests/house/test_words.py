@@ -37,7 +37,6 @@ PRIVATE_WORDS: dict[str, str] = {
 ANY_PRIVATE_WORD = re.compile(rf"(?<![A-Za-z])(?:{'|'.join(PRIVATE_WORDS)})(?![A-Za-z])", re.IGNORECASE)
 
 ALLOWED: dict[str, tuple[str, ...]] = {
-    "tests/behaviour/commands.py": ("--robot nobody",),
     "tests/terrain/effects/test_catalogue.py": ("steering_play=0.01",),
     "data/effects/library.yaml": ("[steering_play]", "[steering_play_rad]"),
     "README.md": ("told:NAME",),
