@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Callable
 from difflib import get_close_matches
 from itertools import groupby
 from operator import attrgetter
@@ -66,19 +65,6 @@ class Terrain(click.Group):
 app = click.version_option(__version__, prog_name="terrain")(Terrain(context_settings=HELP))
 
 
-def note_once(usual: Callable[..., None]) -> Callable[..., None]:
-    """Return what shows warnings: as usual, but of drives outside a robot's region the first alone, as a note."""
-
-    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
-        if not issubclass(category, OutsideRegionWarning):
-            usual(message, category, *place, **more)
-            return
-        warnings.simplefilter("ignore", OutsideRegionWarning)
-        click.echo(f"note: {message}", err=True)
-
-    return show
-
-
 def one_line(message: str) -> str:
     r"""Return a message as one line of a bounded length: files of strangers are quoted in messages.
 
@@ -95,7 +81,16 @@ def one_line(message: str) -> str:
 
 def main() -> None:
     """Run the command line: a user's mistake is one sentence and exit code 2, a fault keeps its traceback."""
-    warnings.showwarning = note_once(warnings.showwarning)
+    usual = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        if not issubclass(category, OutsideRegionWarning):
+            usual(message, category, *place, **more)
+            return
+        warnings.simplefilter("ignore", OutsideRegionWarning)  # of such drives the first alone is a note
+        click.echo(f"note: {message}", err=True)
+
+    warnings.showwarning = show
     try:
         code = app(standalone_mode=False, prog_name="terrain")
         if getattr(code, "interrupted", False):  # it shows what was found until the command was stopped

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import click
-from pydantic.fields import FieldInfo
 
 from pipelines.cli.table import Command
 from pipelines.report.results import Result, write_json
@@ -32,16 +31,29 @@ class OneFile(click.Command):
 
     def __init__(self, command: Command) -> None:
         self.module, self.command = import_module(command.module), command
-        fields = self.module.Settings.model_fields | Output.model_fields
-        parameters = [_parameter(name, field) for name, field in fields.items() if field.alias]
+        parameters: list[click.Parameter] = []
+        for name, field in (self.module.Settings.model_fields | Output.model_fields).items():
+            shown = field.alias  # the model reads all values, so that they are texts here
+            if not shown:
+                continue
+            if not shown.startswith("-"):
+                parameters.append(click.Argument([name], required=False))
+            elif field.annotation is bool:
+                names = f"{shown}/--no-{shown.removeprefix('--')}" if field.default else shown
+                parameters.append(click.Option([names, name], is_flag=True, default=None, type=bool))
+            else:
+                parameters.append(click.Option([shown, name], multiple=field.json_schema_extra["repeated"]))
         super().__init__(command.name, params=parameters, callback=self._execute)
 
     def _execute(self, **options: Any) -> Result:
         from pipelines.report.terminal import print_report, progress_bar
 
-        # what is not given is None, or () of an option that may be repeated
-        given = {name: value for name, value in options.items() if value not in (None, ())}
-        output = Output(**{name: given.pop(name) for name in Output.model_fields if name in given})
+        given: dict[str, Any] = {}
+        of_output: dict[str, Any] = {}
+        for name, value in options.items():
+            if value not in (None, ()):  # what is not given is None, or () of an option that may be repeated
+                (of_output if name in Output.model_fields else given)[name] = value
+        output = Output(**of_output)
         if output.json_file is not None:
             check_file(output.json_file, "--json")
         if output.report_file is not None:
@@ -67,17 +79,6 @@ class OneFile(click.Command):
                 formatter.write_dl(rows)
 
 
-def _parameter(name: str, field: FieldInfo) -> click.Parameter:
-    """Return the parameter of a field; the model reads all values, so that they are texts here."""
-    shown, extra = str(field.alias), typing.cast("dict[str, Any]", field.json_schema_extra)
-    if not shown.startswith("-"):
-        return click.Argument([name], required=False)
-    if field.annotation is bool:
-        names = f"{shown}/--no-{shown.removeprefix('--')}" if field.default else shown
-        return click.Option([names, name], is_flag=True, default=None, type=bool)
-    return click.Option([shown, name], multiple=extra["repeated"])
-
-
 def described_options(model: type[Settings]) -> dict[str, list[tuple[str, str]]]:
     """Return how options are written and what they are, by the first line of the class that declares them.
 
@@ -90,19 +91,19 @@ def described_options(model: type[Settings]) -> dict[str, list[tuple[str, str]]]
         groups[heading] = []
         heading_of |= dict.fromkeys(vars(kind).get("__annotations__", ()), heading)
     for name, field in model.model_fields.items():
-        if field.alias:
-            heading = REQUIRED if field.is_required() else heading_of[name]
-            groups[heading].append((_written(field, field.alias), _text(field)))
+        if not field.alias:
+            continue
+        option, default = field.alias, field.default
+        if field.annotation is bool:
+            option += f" / --no-{option.removeprefix('--')}" if default else ""
+        elif option.startswith("-"):
+            option += f" {_metavar(field.annotation)}"
+        text = " ".join((field.description or "").split())
+        if not (field.is_required() or default is None or isinstance(default, bool) or default in ("", ())):
+            shown = ",".join(map(str, default)) if isinstance(default, tuple) else default
+            text += f" [default: {shown}]"
+        groups[REQUIRED if field.is_required() else heading_of[name]].append((option, text))
     return {heading: rows for heading, rows in groups.items() if rows}
-
-
-def _written(field: FieldInfo, option: str) -> str:
-    """Return an option with what stands for its value."""
-    if not option.startswith("-"):
-        return option
-    if field.annotation is bool:
-        return f"{option} / --no-{option.removeprefix('--')}" if field.default else option
-    return f"{option} {_metavar(field.annotation)}"
 
 
 def _metavar(kind: Any) -> str:
@@ -112,12 +113,3 @@ def _metavar(kind: Any) -> str:
     if typing.get_origin(kind) in (typing.Union, types.UnionType):
         return _metavar(next(each for each in typing.get_args(kind) if each is not type(None)))
     return {int: "N", float: "X", Path: "PATH"}.get(kind, "TEXT")
-
-
-def _text(field: FieldInfo) -> str:
-    """Return the help of a field with its default; none is shown of a flag."""
-    text, default = " ".join((field.description or "").split()), field.default
-    if field.is_required() or default is None or isinstance(default, bool) or default in ("", ()):
-        return text
-    shown = ",".join(map(str, default)) if isinstance(default, tuple) else default
-    return f"{text} [default: {shown}]"

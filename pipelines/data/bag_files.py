@@ -15,7 +15,7 @@ import sqlite3
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -93,7 +93,11 @@ def find_bags(place: Path) -> list[Path]:
     """
     if place.is_file():
         return [place] if place.suffix.lower() in SUFFIXES else []
-    folders = {path.parent for path in place.rglob(METADATA) if _is_description(path)}
+    folders = set()
+    for path in place.rglob(METADATA):
+        with suppress(OSError), path.open("rb") as file:
+            if b"rosbag2_bagfile_information" in file.read(4096):  # other programs have files of that name
+                folders.add(path.parent)
     files = {
         path
         for path in place.rglob("*")
@@ -103,15 +107,6 @@ def find_bags(place: Path) -> list[Path]:
         and not any(part.startswith(".") for part in path.relative_to(place).parts)
     }
     return sorted(folders | files)
-
-
-def _is_description(path: Path) -> bool:
-    """Return whether a file is the description of a bag; other programs have files of that name."""
-    try:
-        with path.open("rb") as file:
-            return b"rosbag2_bagfile_information" in file.read(4096)
-    except OSError:
-        return False
 
 
 def open_bag(path: Path) -> Bag:
@@ -306,8 +301,8 @@ def _chunk_records(place: str, chunk: Chunk, faults: Faults) -> list[Any]:
     from mcap.stream_reader import breakup_chunk
 
     try:
-        unpacked = replace(chunk, compression="", data=_unpacked(chunk))
-        return list(breakup_chunk(unpacked, validate_crc=True))
+        content = _unpacked(chunk.data, chunk.compression, chunk.uncompressed_size)
+        return list(breakup_chunk(replace(chunk, compression="", data=content), validate_crc=True))
     except (EndOfFile, struct.error):
         text = "a chunk ends in the middle of a record"
     except ValueError as error:
@@ -316,19 +311,17 @@ def _chunk_records(place: str, chunk: Chunk, faults: Faults) -> list[Any]:
     return []
 
 
-def _unpacked(chunk: Chunk) -> bytes:
+def _unpacked(packed: bytes, compression: str, size: int) -> bytes:
     """Return the content of a chunk; ``ValueError`` where it is damaged, or would grow too large."""
-    packed: bytes = chunk.data
-    size: int = chunk.uncompressed_size
     if size > MAX_RECORD_BYTES or size > max(MAX_RATIO * len(packed), SMALL_BYTES):
         raise ValueError(f"a chunk of {len(packed)} bytes would have {size} bytes when unpacked")
-    if chunk.compression not in ("", "lz4", "zstd"):
-        raise ValueError(f"a chunk is packed by {shown(chunk.compression)}, lz4 and zstd are read")
+    if compression not in ("", "lz4", "zstd"):
+        raise ValueError(f"a chunk is packed by {shown(compression)}, lz4 and zstd are read")
     content = packed
-    if chunk.compression:
+    if compression:
         lz4, zstandard = library("lz4.frame"), library("zstandard")
         try:
-            if chunk.compression == "zstd":
+            if compression == "zstd":
                 with zstandard.ZstdDecompressor().stream_reader(packed) as reader:
                     content = bytes(reader.read(size + 1))
             else:
@@ -344,8 +337,17 @@ def _open_by_rosbags(path: Path, magic: bytes) -> Any:
     """Return the reader of rosbags of a bag of ROS 1, or of a storage file of ROS 2 in SQLite."""
     rosbags = library("rosbags.rosbag1" if magic == ROS1_MAGIC else "rosbags.rosbag2")
     try:
-        if magic == SQLITE_MAGIC:
-            _refuse_views(path)
+        if magic == SQLITE_MAGIC:  # to look into a view could take forever
+            query = (
+                "select count(*) from sqlite_master where name in ('topics', 'messages') "
+                "and type = 'table' and sql not like '%virtual%'"
+            )
+            place = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
+            with closing(sqlite3.connect(place, uri=True)) as store:
+                if store.execute(query).fetchone()[0] != 2:
+                    raise LogError(
+                        f"{short_name(path)}: is no bag, it lacks the tables 'topics' and 'messages'"
+                    )
         reader = rosbags.Reader(path)
         reader.open()
     except TerrainError:
@@ -356,18 +358,6 @@ def _open_by_rosbags(path: Path, magic: bytes) -> Any:
         for position, chunk in reader.chunks.items():
             reader.chunks[position] = chunk._replace(decompressor=_bounded(chunk.decompressor))
     return reader
-
-
-def _refuse_views(path: Path) -> None:
-    """Refuse a database whose messages are a view: to look into it could take forever."""
-    query = (
-        "select count(*) from sqlite_master where name in ('topics', 'messages') "
-        "and type = 'table' and sql not like '%virtual%'"
-    )
-    place = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
-    with closing(sqlite3.connect(place, uri=True)) as store:
-        if store.execute(query).fetchone()[0] != 2:
-            raise LogError(f"{short_name(path)}: is no bag, it lacks the tables 'topics' and 'messages'")
 
 
 def _bounded(decompress: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
@@ -433,7 +423,15 @@ def decoder_of(place: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
     if topic.encoding not in ("cdr", "ros1", "protobuf"):
         raise LogError(f"{at} is encoded as {shown(topic.encoding)}; cdr, ros1, protobuf and json are read")
     try:
-        return _of_protobuf(at, topic) if topic.encoding == "protobuf" else _of_ros(at, topic, distro)
+        if topic.encoding != "protobuf":
+            return _of_ros(at, topic, distro)
+        decoders, records = library("mcap_protobuf.decoder"), library("mcap.records")
+        definition = topic.definition.encode("latin-1", "replace")
+        schema = records.Schema(1, definition, topic.schema_encoding, topic.kind)
+        decoder: Callable[[bytes], Any] | None = decoders.DecoderFactory().decoder_for("protobuf", schema)
+        if decoder is None:
+            raise LogError(f"{at} has a definition in {shown(topic.schema_encoding)}, 'protobuf' is read")
+        return decoder
     except TerrainError:
         raise
     except RecursionError as error:
@@ -442,18 +440,9 @@ def decoder_of(place: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
         raise LogError(f"{at}: its definition is damaged ({one_line(error)})") from error
 
 
-def _of_protobuf(at: str, topic: Topic) -> Callable[[bytes], Any]:
-    decoders, records = library("mcap_protobuf.decoder"), library("mcap.records")
-    definition = topic.definition.encode("latin-1", "replace")
-    schema = records.Schema(1, definition, topic.schema_encoding, topic.kind)
-    decoder: Callable[[bytes], Any] | None = decoders.DecoderFactory().decoder_for("protobuf", schema)
-    if decoder is None:
-        raise LogError(f"{at} has a definition in {shown(topic.schema_encoding)}, 'protobuf' is read")
-    return decoder
-
-
 def _of_ros(at: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
     typesys = library("rosbags.typesys")
+    nodes = library("rosbags.interfaces").Nodetype
     if len(topic.definition) > MAX_DEFINITION_CHARACTERS:
         raise LogError(f"{at}: its definition is longer than {MAX_DEFINITION_CHARACTERS} characters")
     package, _, name = short_type(topic.kind).partition("/")
@@ -466,7 +455,18 @@ def _of_ros(at: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
                 types.update(typesys.get_types_from_idl(idl) if idl.strip() else {})
         else:
             types = dict(typesys.get_types_from_msg(topic.definition, kind))
-        _refuse_strange_types(at, types)
+        # names that are none, of which the library makes code, and arrays that would be very much code
+        n_fields = n_elements = 0
+        for each, (constants, fields) in types.items():
+            names = [field[0] for field in (*constants, *fields)]
+            if not _TYPE.fullmatch(each) or not all(map(str.isidentifier, names)):
+                raise LogError(f"{at}: its definition has a name that is none: {shown(each)}")
+            n_fields += len(fields)
+            for _, (node, described) in fields:
+                if node == nodes.ARRAY and (described[0][0] != nodes.BASE or "string" in described[0][1]):
+                    n_elements += described[1]
+        if max(n_fields, n_elements) > MAX_ELEMENTS:
+            raise LogError(f"{at}: its definition has more than {MAX_ELEMENTS} fields or elements")
         store = typesys.get_typestore(typesys.Stores.EMPTY)
         store.register(types)
     else:
@@ -477,19 +477,3 @@ def _of_ros(at: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
     store.get_msgdef(kind)
     deserialize = store.deserialize_cdr if topic.encoding == "cdr" else store.deserialize_ros1
     return lambda content: deserialize(content, kind)
-
-
-def _refuse_strange_types(at: str, types: Mapping[str, Any]) -> None:
-    """Refuse names that are none, of which the library makes code, and arrays that would be very much code."""
-    from rosbags.interfaces import Nodetype
-
-    n_fields = n_elements = 0
-    for name, (constants, fields) in types.items():
-        if not _TYPE.fullmatch(name) or not all(each[0].isidentifier() for each in (*constants, *fields)):
-            raise LogError(f"{at}: its definition has a name that is none: {shown(name)}")
-        n_fields += len(fields)
-        for _, (node, described) in fields:
-            if node == Nodetype.ARRAY and (described[0][0] != Nodetype.BASE or "string" in described[0][1]):
-                n_elements += described[1]
-    if max(n_fields, n_elements) > MAX_ELEMENTS:
-        raise LogError(f"{at}: its definition has more than {MAX_ELEMENTS} fields or elements")

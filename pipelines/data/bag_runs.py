@@ -76,7 +76,14 @@ def read_run(
     topics = topics_of(bag)
     exported = topics.get(RUN_TOPIC)
     if mapping is None and exported is not None and exported.kind == STRING:
-        return _exported_run(bag, place, topics, repair=repair)
+        prefix = RUN_TOPIC.rpartition("/")[0]
+        names = frozenset(each for each in topics if each.startswith(prefix))
+        counted = Faults(Counter())
+        document, messages = _document(bag, place, topics, names, counted)
+        tolerant = document.live or repair  # a recording that ends early is read as far as it goes
+        if counted.first and not tolerant:
+            raise LogError(counted.first)
+        return run_of(place, document, messages, counted if tolerant else Faults(None))
     if not topics:
         raise LogError(f"{place}: has no topic")
     mapping = standard_mapping(place, list(topics.values())) if mapping is None else mapping
@@ -85,7 +92,9 @@ def read_run(
         raise ConfigError(f"{place}: a bag does not name its robot: give it by --robot or in the mapping")
     faults = Faults(Counter() if repair else None)
     streams, intervals = _mapped(bag, mapping, topics, wheel_radius_m(name, robot), faults)
-    parts = _parts(path, folder)
+    # called by the names of the folders down to its bag, and the bag's own
+    within = Path(path.resolve().name) if path == folder else path.relative_to(folder)
+    parts = (within.with_suffix("") if path.is_file() else within).parts
     refuse_apart("_".join(parts), streams)
     if not mapping.labels:
         terrain = mapping.terrain or (parts[0] if len(parts) > 1 else "")
@@ -133,18 +142,6 @@ def _mapped(
     return mapped_streams(place, mapping, topics, KINDS, decoder, messages, radius_m, faults, start_ns)
 
 
-def _exported_run(bag: Bag, place: str, topics: Mapping[str, Topic], *, repair: bool) -> RunLog:
-    """Return the run that was exported or recorded; a recording that ends early is read as far as it goes."""
-    prefix = RUN_TOPIC.rpartition("/")[0]
-    names = frozenset(name for name in topics if name.startswith(prefix))
-    counted = Faults(Counter())
-    document, messages = _document(bag, place, topics, names, counted)
-    tolerant = document.live or repair
-    if counted.first and not tolerant:
-        raise LogError(counted.first)
-    return run_of(place, document, messages, counted if tolerant else Faults(None))
-
-
 def _document(
     bag: Bag, place: str, topics: Mapping[str, Topic], names: frozenset[str], faults: Faults
 ) -> tuple[RunDocument, dict[str, list[bytes]]]:
@@ -184,12 +181,3 @@ def wheel_radius_m(name: str, given: Robot | None) -> float | None:
         return robot_named(name, given).wheel_radius_m
     except ConfigError:
         return None
-
-
-def _parts(path: Path, folder: Path) -> tuple[str, ...]:
-    """Return the names that a run is called by: those of the folders down to its bag, and the bag's own."""
-    if path == folder:
-        path = path.resolve()
-        return (path.stem if path.is_file() else path.name,)
-    within = path.relative_to(folder)
-    return (within.with_suffix("") if path.is_file() else within).parts

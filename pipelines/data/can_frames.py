@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
@@ -34,7 +34,7 @@ from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.parts import Assembler, Part
 from terrain.logs.samples import checked_stream, whole_run_label
 from terrain.logs.schema import UNIT_SCALES, canonical_unit, check_unit, unit_of
-from terrain.records import Reading, RunLog, Stream
+from terrain.records import Reading, RunLog
 
 if TYPE_CHECKING:
     from can import Message as Frame
@@ -157,9 +157,16 @@ def load_layout(path: str | Path | None = None, *, complete: bool = True) -> Lay
         for stream, names in SIGNALS.items()
         for column, (channel, name) in enumerate(names.items())
     }
+    cantools = library("cantools")
+    try:
+        messages = cantools.database.load_file(path, database_format="dbc", strict=True).messages
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be opened ({error.strerror})") from error
+    except Exception as error:  # whatever a parser does with a damaged file
+        raise ConfigError(f"{path}: is no DBC ({one_line(error)})") from error
     owner: dict[str, Any] = {}
     by_stream: dict[str, list[MessagePlan]] = {}
-    for message in _read(path).messages:
+    for message in messages:
         used = [signal for signal in message.signals if signal.name in places]
         for signal in used:
             if owner.setdefault(signal.name, message) is not message:
@@ -181,7 +188,19 @@ def load_layout(path: str | Path | None = None, *, complete: bool = True) -> Lay
                 f"{path}: the message {message.name!r} has {message.length} bytes; "
                 f"a frame of classical CAN has at most {MAX_BYTES}"
             )
-        by_stream.setdefault(carried[0], []).append(_message_plan(message, carried[0], signals))
+        by_name = {signal.name: signal for signal in message.signals}
+        others = {
+            name: signal.conversion.raw_to_scaled(signal.raw_initial or 0, False)
+            for name, signal in by_name.items()
+            if name not in places
+        }
+        counter_bits = by_name[COUNTER].length if COUNTER in by_name else 0
+        crc_bits = 0
+        if CRC in by_name and by_name[CRC].length == 8:
+            raw = dict.fromkeys(by_name, 0) | {CRC: 255}
+            crc_bits = int.from_bytes(message.encode(raw, scaling=False, padding=False, strict=False), "big")
+        plan = MessagePlan(message, carried[0], signals, counter_bits, crc_bits, others)
+        by_stream.setdefault(carried[0], []).append(plan)
     missing = [name for name, place in places.items() if name not in owner and place[2] not in OPTIONAL]
     if complete and missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
@@ -189,16 +208,6 @@ def load_layout(path: str | Path | None = None, *, complete: bool = True) -> Lay
     plans = [plan for of_stream in by_stream.values() for plan in of_stream]
     by_key = {(plan.message.frame_id, plan.message.is_extended_frame): plan for plan in plans}
     return Layout(path.name, by_key, by_stream)
-
-
-def _read(path: Path) -> Any:
-    cantools = library("cantools")
-    try:
-        return cantools.database.load_file(path, database_format="dbc", strict=True)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be opened ({error.strerror})") from error
-    except Exception as error:  # whatever a parser does with a damaged file
-        raise ConfigError(f"{path}: is no DBC ({one_line(error)})") from error
 
 
 def _signal_plan(path: Path, signal: Any, column: int, channel: str) -> SignalPlan:
@@ -222,34 +231,14 @@ def _signal_plan(path: Path, signal: Any, column: int, channel: str) -> SignalPl
         low, high = sorted([convert(least, False), convert(most, False)]) if least <= most else (1.0, 0.0)
     if low > high:
         raise ConfigError(f"{path}: the signal {signal.name!r} has no value between its bounds")
-    factor = _factor(path, signal, channel)
-    step = 0.0 if signal.is_float else abs(scale)
-    return SignalPlan(signal.name, column, factor, step, float(low), float(high), absent)
-
-
-def _factor(path: Path, signal: Any, channel: str) -> float:
-    """Return the factor from a signal's unit to that of its channel; a DBC has its own offsets."""
     given, required = signal.unit or "", unit_of(channel)
     if (required == "code" and given in UNITLESS) or (required == "ratio" and not given):
-        return 1.0
-    check_unit(f"{path}: the signal {signal.name!r} of {channel}", given, required)
-    return UNIT_SCALES[canonical_unit(given)][1]
-
-
-def _message_plan(message: Any, stream: str, signals: tuple[SignalPlan, ...]) -> MessagePlan:
-    used = {signal.name for signal in signals}
-    by_name = {signal.name: signal for signal in message.signals}
-    others = {
-        name: signal.conversion.raw_to_scaled(signal.raw_initial or 0, False)
-        for name, signal in by_name.items()
-        if name not in used
-    }
-    counter_bits = by_name[COUNTER].length if COUNTER in by_name else 0
-    crc_bits = 0
-    if CRC in by_name and by_name[CRC].length == 8:
-        raw = dict.fromkeys(by_name, 0) | {CRC: 255}
-        crc_bits = int.from_bytes(message.encode(raw, scaling=False, padding=False, strict=False), "big")
-    return MessagePlan(message, stream, signals, counter_bits, crc_bits, others)
+        factor = 1.0
+    else:  # a DBC has its own offsets
+        check_unit(f"{path}: the signal {signal.name!r} of {channel}", given, required)
+        factor = UNIT_SCALES[canonical_unit(given)][1]
+    step = 0.0 if signal.is_float else abs(scale)
+    return SignalPlan(signal.name, column, factor, step, float(low), float(high), absent)
 
 
 def _crc_of(plan: MessagePlan, data: bytes) -> int:
@@ -435,50 +424,39 @@ def read_run(path: Path, folder: Path, layout: Layout, robot: str, *, repair: bo
     """
     receiver = Receiver(layout, tuple(SIGNALS), most=math.inf)
     first_s: float | None = None
-    for frame in _frames(path):
-        first_s = frame.timestamp if first_s is None else first_s
-        frame.timestamp -= first_s
-        receiver.take(frame)
+    can = library("can")
+    reader, mode = READERS[path.suffix.lower()]
+    try:
+        with path.open(mode) as file:  # a reader that fails leaves a file of its own open
+            for frame in getattr(can, reader)(file):
+                first_s = frame.timestamp if first_s is None else first_s
+                frame.timestamp -= first_s
+                receiver.take(frame)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:  # whatever a parser does with a damaged file
+        raise LogError(f"{path}: is no log of a CAN bus, or is damaged ({one_line(error)})") from error
     readings, dropped = receiver.readings(math.inf), receiver.dropped
     faults = {kind: n for kind, n in dropped.items() if kind not in USUAL}
     if faults and not repair:
         kind, n = max(faults.items(), key=lambda fault: fault[1])
         raise LogError(f"{path}: {n} of kind {kind!r}; read it with --repair to leave them out")
-    streams = {
-        "commands" if name == "twist" else name: _stream(
-            path, layout, name, reading, dropped if repair else None
+    streams = {}
+    for name in readings:
+        if name not in RECEIVED:
+            continue
+        columns = sorted(layout.columns(name) | ({QUATERNION[3]} if name == "odometry" else set()))
+        channels = tuple(SIGNALS[name])
+        streams["commands" if name == "twist" else name] = checked_stream(
+            f"{path}, {name}",
+            readings[name].time_s,
+            readings[name].values[:, columns],
+            [channels[column] for column in columns],
+            row_of=lambda sample: sample + 1,
+            repairs=dropped if repair else None,
         )
-        for name, reading in readings.items()
-        if name in RECEIVED
-    }
     if not streams:
         raise LogError(f"{path}: has no frame of the messages of {layout.name}")
     place = path.relative_to(folder).with_suffix("").parts
     labels = (whole_run_label(streams, place[0]),) if len(place) > 1 else ()
     return RunLog("_".join(place), robot, streams, labels, source=str(path), dropped=dropped)
-
-
-def _frames(path: Path) -> Iterator[Frame]:
-    can = library("can")
-    name, mode = READERS[path.suffix.lower()]
-    try:
-        with path.open(mode) as file:  # a reader that fails leaves a file of its own open
-            yield from getattr(can, name)(file)
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:  # whatever a parser does with a damaged file
-        raise LogError(f"{path}: is no log of a CAN bus, or is damaged ({one_line(error)})") from error
-
-
-def _stream(path: Path, layout: Layout, name: str, reading: Reading, repairs: Counter[str] | None) -> Stream:
-    """Return a stream with the channels that the DBC has."""
-    columns = sorted(layout.columns(name) | ({QUATERNION[3]} if name == "odometry" else set()))
-    channels = tuple(SIGNALS[name])
-    return checked_stream(
-        f"{path}, {name}",
-        reading.time_s,
-        reading.values[:, columns],
-        [channels[column] for column in columns],
-        row_of=lambda sample: sample + 1,
-        repairs=repairs,
-    )

@@ -6,6 +6,8 @@ import logging
 import math
 from collections.abc import Callable
 from functools import partial
+from itertools import chain
+from operator import attrgetter
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -43,7 +45,7 @@ FOUND_BY: dict[str, tuple[str, tuple[str, ...]]] = {
     "drive": ("terrain.logs.drive:find_sessions", ("samples.csv.gz", "*/samples.csv.gz")),
     "robotino": (
         "terrain.logs.robotino:find_runs",
-        tuple(f"{'../' * n}camera_params.json" for n in range(4)),
+        tuple(f"{above}camera_params.json" for above in ("", "../", "../../", "../../../")),
     ),
     "drive-recording": ("terrain.logs.drive:find_recordings", ("*.csv.gz", "*/*.csv.gz")),
     "testbed": ("terrain.logs.testbed:find_runs", ("smooth.csv", "grouser.csv")),
@@ -139,7 +141,7 @@ def load(settings: RunsSettings) -> tuple[list[RunLog], list[str]]:
 
     folder, repair = settings.data, settings.repair
     runs: list[RunLog] = []
-    faults: list[str] = []
+    skipped: list[str] = []
     places: dict[str, list[str]] = {}
     for loader in run_loaders(settings):
         try:
@@ -147,19 +149,20 @@ def load(settings: RunsSettings) -> tuple[list[RunLog], list[str]]:
         except LogError as error:
             if not repair:
                 raise
-            faults.append(str(error))
+            skipped.append(f"run skipped: {error}")
             continue
         runs.append(run)
         places.setdefault(run.run_id, []).append(str(loader.run_folder or run.source))
     if not runs:
-        raise LogError(f"{folder}: not one run could be read, the first for this: {faults[0]}")
+        first = skipped[0].removeprefix("run skipped: ")
+        raise LogError(f"{folder}: not one run could be read, the first for this: {first}")
     for run_id, found in places.items():
         if len(found) > 1:
             raise LogError(f"{folder}: {len(found)} runs have the id {run_id!r} ({' and '.join(found)})")
-    runs = sorted(one_spelling(str(folder), runs, repair=repair), key=lambda run: run.run_id)
+    runs = sorted(one_spelling(str(folder), runs, repair=repair), key=attrgetter("run_id"))
     if isinstance(settings, AlignedRunsSettings):
         runs = chosen_runs(runs, settings)
-    return runs, [f"run skipped: {fault}" for fault in faults]
+    return runs, skipped
 
 
 def run_loaders(settings: RunsSettings) -> list[RunLoader]:
@@ -223,19 +226,26 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot
         return can_frames.find_runs(folder, can_frames.load_layout(mapping, complete=False), name)
     if mapping is not None and layout not in ("auto", "csv"):
         raise ConfigError(f"a mapping file is for CSV files, not for the layout {layout!r}")
-    if mapping is not None:
-        return _mapped(folder, mapping, robot)
+    if mapping is not None:  # a stream may lie in a bag
+        from pipelines.data import bag_runs
+        from terrain.logs.mapping import find_runs, load_mapping
+
+        read = load_mapping(mapping)
+        radius_m = bag_runs.wheel_radius_m(read.robot, robot)
+        return find_runs(folder, read, partial(bag_runs.read_stream, radius_m=radius_m))
     if layout == "csv":
         raise ConfigError("the layout 'csv' needs a mapping file")
-    asked = [layout]
-    if layout == "auto":
-        files = folder.resolve()
-        asked = [
-            name for name, (_, parts) in FOUND_BY.items() if any(any(files.glob(each)) for each in parts)
-        ]
-        if "robotino" in asked:  # its files have the ending of recordings, below the file of a camera
-            asked = [name for name in asked if name != "drive-recording"]
-    found = {name: readers for name in asked if (readers := resolve_name(FOUND_BY[name][0])(folder))}
+    found: dict[str, Any] = {}
+    files, by_camera = folder.resolve(), False
+    for name, (finder, patterns) in FOUND_BY.items():
+        asked = layout == name
+        if layout == "auto":
+            asked = any(chain.from_iterable(map(files.glob, patterns)))
+            by_camera |= asked and name == "robotino"
+            # files of Robotino have the ending of recordings, below the file of a camera
+            asked = asked and not (by_camera and name == "drive-recording")
+        if asked and (readers := resolve_name(finder)(folder)):
+            found[name] = readers
     if len(found) > 1:
         raise LogError(f"{folder}: mixes the layouts {' and '.join(found)}; choose one with --format")
     if not found and layout == "auto":
@@ -252,16 +262,6 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot
 
         return drive.find_recorded_runs(folder, lambda name: drive_robot(robot_named(name, robot)))
     return next(iter(found.values()), [])
-
-
-def _mapped(folder: Path, mapping: str | Path, robot: Robot | None) -> Readers:
-    """Return the readers of files by a mapping; a stream may lie in a bag."""
-    from pipelines.data import bag_runs
-    from terrain.logs import mapping as by_mapping
-
-    read = by_mapping.load_mapping(mapping)
-    radius_m = bag_runs.wheel_radius_m(read.robot, robot)
-    return by_mapping.find_runs(folder, read, partial(bag_runs.read_stream, radius_m=radius_m))
 
 
 def drive_robot(robot: Robot | None) -> DriveRobot:

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from terrain.logs.clock import ClockEstimate
     from terrain.logs.duplicates import SharedStretch
     from terrain.logs.plausibility import Check, StreamQuality
-    from terrain.records import RunLog
-    from terrain.robots import Robot
 
 EXAMPLE = "terrain inspect logs/ --robot husky"
 
@@ -84,35 +82,27 @@ MAX_ROWS = 12  #: Rows of streams on the first screen: those that need a look co
 
 def run(settings: Settings, progress: Progress = silent) -> Inspection:
     """Return the quality of the runs under a folder."""
+    from features.motion import odd_stretches
+    from terrain.errors import ConfigError, DataError
+    from terrain.logs.clock import estimate_clock
     from terrain.logs.duplicates import shared_stretches
+    from terrain.logs.plausibility import stream_quality
     from terrain.logs.run_folders import data_digest
-    from terrain.robots import load_robot
+    from terrain.robots import load_robot, robot_named
 
     runs, skipped = load(settings)
     robot = None if settings.robot is None else load_robot(settings.robot)
     inspected = []
     for done, each in enumerate(runs, 1):
-        inspected.append(_inspected(each, robot))
+        try:
+            clock = estimate_clock(each, track_m=robot_named(each.robot, robot).track_m)
+        except (ConfigError, DataError):
+            clock = None
+        streams = {name: stream_quality(stream) for name, stream in each.streams.items()}
+        about = each.run_id, each.terrains, dict(each.dropped), streams, clock
+        inspected.append(InspectedRun(*about, odd_stretches(each), verdict(each, robot)))
         progress("inspect", done, len(runs))
     return Inspection(len(runs), data_digest(runs), tuple(skipped), tuple(inspected), shared_stretches(runs))
-
-
-def _inspected(run: RunLog, robot: Robot | None) -> InspectedRun:
-    from features.motion import odd_stretches
-    from terrain.errors import ConfigError, DataError
-    from terrain.logs.clock import estimate_clock
-    from terrain.logs.plausibility import stream_quality
-    from terrain.robots import robot_named
-
-    try:
-        clock = estimate_clock(run, track_m=robot_named(run.robot, robot).track_m)
-    except (ConfigError, DataError):
-        clock = None
-    streams = {name: stream_quality(stream) for name, stream in run.streams.items()}
-    checks = verdict(run, robot)
-    return InspectedRun(
-        run.run_id, run.terrains, dict(run.dropped), streams, clock, odd_stretches(run), checks
-    )
 
 
 def report(result: Inspection) -> Report:

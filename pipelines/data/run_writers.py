@@ -16,7 +16,7 @@ import numpy as np
 from pipelines.data.bag_files import McapWriter, library
 from pipelines.data.settings import Target
 from terrain.files.atomic import atomic_file, atomic_folder
-from terrain.kinematics.standard_messages import StandardTopic, standard_topic
+from terrain.kinematics.standard_messages import standard_topic
 from terrain.logs.mapping import DISTRO
 from terrain.logs.run_folders import (
     WINDOWS_FILE,
@@ -28,7 +28,7 @@ from terrain.logs.run_folders import (
     write_run,
 )
 from terrain.logs.run_topics import Messages, origin_of, run_messages, stamps_ns
-from terrain.records import Array, RunLog
+from terrain.records import RunLog
 
 
 def messages_of_run(run: RunLog, windows: Sequence[RecordedWindow] = ()) -> Iterator[Messages]:
@@ -44,26 +44,23 @@ def messages_of_run(run: RunLog, windows: Sequence[RecordedWindow] = ()) -> Iter
     yield from run_messages(run, [(window.end_s, window.model_dump_json()) for window in windows])
     for name, stream in run.streams.items():
         topic = standard_topic(name, stream)
-        if topic is not None:
-            yield serialized(topic, stamps_ns(stream.time_s, origin_of(run)))
-
-
-def serialized(topic: StandardTopic, log_ns: Array) -> Messages:
-    """Return standard messages (CDR), one for each stamp, which their headers bear."""
-    typesys = library("rosbags.typesys")
-    store = typesys.get_typestore(typesys.Stores[DISTRO])
-    message = zero_message(store, topic.kind)
-    for path, value in topic.fixed.items():
-        setter(message, path)(value)
-    setters = [setter(message, path) for path in topic.paths]
-    contents = []
-    for stamp_ns, row in zip(log_ns.tolist(), topic.numbers.tolist(), strict=True):
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        for put, number in zip(setters, row, strict=True):
-            put(number)
-        contents.append(bytes(store.serialize_cdr(message, topic.kind)))
-    definition = str(store.generate_msgdef(topic.kind, ros_version=2)[0])
-    return Messages(topic.topic, topic.kind, definition, log_ns, contents)
+        if topic is None:
+            continue
+        typesys = library("rosbags.typesys")
+        store = typesys.get_typestore(typesys.Stores[DISTRO])
+        message = zero_message(store, topic.kind)
+        for path, value in topic.fixed.items():
+            setter(message, path)(value)
+        setters = [setter(message, path) for path in topic.paths]
+        contents = []
+        log_ns = stamps_ns(stream.time_s, origin_of(run))
+        for stamp_ns, row in zip(log_ns.tolist(), topic.numbers.tolist(), strict=True):
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+            for put, number in zip(setters, row, strict=True):
+                put(number)
+            contents.append(bytes(store.serialize_cdr(message, topic.kind)))
+        definition = str(store.generate_msgdef(topic.kind, ros_version=2)[0])
+        yield Messages(topic.topic, topic.kind, definition, log_ns, contents)
 
 
 def setter(message: Any, path: str) -> Callable[[Any], None]:
@@ -130,7 +127,21 @@ def write(place: Path, run: RunLog, windows: Sequence[RecordedWindow], target: T
     else:
         with atomic_folder(place) as unfinished:
             inner = unfinished / place.name  # a bag's files bear the name of its folder
-            _write_ros2(inner, topics, "SQLITE3" if target == "ros2" else "MCAP")
+            rosbag2, typesys = library("rosbags.rosbag2"), library("rosbags.typesys")
+            store = typesys.get_typestore(typesys.Stores[DISTRO])
+            for each in topics:
+                if each.kind not in store.types:
+                    definition = each.definition.partition("=" * 80)[0]
+                    store.register(typesys.get_types_from_msg(definition, each.kind))
+            storage = rosbag2.StoragePlugin["SQLITE3" if target == "ros2" else "MCAP"]
+            with rosbag2.Writer(inner, version=9, storage_plugin=storage) as bag:
+                connections: dict[tuple[str, str], Any] = {}
+                for each in topics:
+                    if (each.topic, each.kind) not in connections:
+                        connection = bag.add_connection(each.topic, each.kind, typestore=store)
+                        connections[each.topic, each.kind] = connection
+                for log_ns, each, content in _in_order(topics):
+                    bag.write(connections[each.topic, each.kind], log_ns, content)
             for path in inner.iterdir():
                 path.rename(unfinished / path.name)
             inner.rmdir()
@@ -138,22 +149,6 @@ def write(place: Path, run: RunLog, windows: Sequence[RecordedWindow], target: T
     for topic in topics:  # several streams may share one
         counts[topic.topic] += len(topic.contents)
     return counts
-
-
-def _write_ros2(folder: Path, topics: Sequence[Messages], storage: str) -> None:
-    rosbag2, typesys = library("rosbags.rosbag2"), library("rosbags.typesys")
-    store = typesys.get_typestore(typesys.Stores[DISTRO])
-    for each in topics:
-        if each.kind not in store.types:
-            store.register(typesys.get_types_from_msg(each.definition.partition("=" * 80)[0], each.kind))
-    with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin[storage]) as writer:
-        connections: dict[tuple[str, str], Any] = {}
-        for each in topics:
-            if (each.topic, each.kind) not in connections:
-                connection = writer.add_connection(each.topic, each.kind, typestore=store)
-                connections[each.topic, each.kind] = connection
-        for log_ns, each, content in _in_order(topics):
-            writer.write(connections[each.topic, each.kind], log_ns, content)
 
 
 def _in_order(topics: Sequence[Messages]) -> Iterator[tuple[int, Messages, bytes]]:

@@ -54,7 +54,15 @@ def _saved(figure: Figure, **options: Any) -> bytes:
 
 def draw(figure: Figure) -> Drawn:
     """Return the figure as matplotlib has it: panels below one another, with the layout fixed."""
-    heights = [_height_in(panel) for panel in figure.panels]
+    heights = []
+    for panel in figure.panels:
+        kinds = Counter(mark.kind for mark in panel.marks)
+        height = 4.5 if panel.equal else PANEL_HEIGHT_IN
+        if kinds["bars"]:
+            height = 0.6 + BAR_HEIGHT_IN * len(panel.marks[0].x) * max(1.0, 0.7 * kinds["bars"])
+        elif set(kinds) == {"strip"}:
+            height = STRIP_HEIGHT_IN
+        heights.append(height)
     drawn = Drawn(
         figsize=(WIDTH_IN, sum(heights) + HEAD_IN),
         dpi=PNG_DPI,
@@ -75,15 +83,6 @@ def draw(figure: Figure) -> Drawn:
     return drawn
 
 
-def _height_in(panel: Panel) -> float:
-    kinds = Counter(mark.kind for mark in panel.marks)
-    if kinds["bars"]:
-        return 0.6 + BAR_HEIGHT_IN * len(panel.marks[0].x) * max(1.0, 0.7 * kinds["bars"])
-    if set(kinds) == {"strip"}:
-        return STRIP_HEIGHT_IN
-    return 4.5 if panel.equal else PANEL_HEIGHT_IN
-
-
 def _draw_panel(axes: Axes, panel: Panel, names: dict[str, int]) -> None:
     n_bars = sum(mark.kind == "bars" for mark in panel.marks)
     for number, mark in enumerate(panel.marks):
@@ -91,10 +90,26 @@ def _draw_panel(axes: Axes, panel: Panel, names: dict[str, int]) -> None:
         style: dict[str, Any] = {"color": colour, "label": plain_line(mark.label) or "_nolegend_"}
         if mark.kind == "strip":
             _draw_strip(axes, mark, names, thin=len(panel.marks) == 1)
-        elif mark.kind == "bars":
-            _draw_bars(axes, mark, number, n_bars, style)
+            continue
+        y, low, high = (np.asarray(each, float) for each in (mark.y, mark.low, mark.high))
+        if mark.kind == "bars":
+            height, places = 0.8 / n_bars, np.arange(len(mark.x))
+            at = places + (number - 0.5 * (n_bars - 1)) * height
+            axes.barh(at, y, height=0.9 * height, alpha=0.85, **style)
+            if mark.low is not None:
+                axes.hlines(at, low, high, color=INK, lw=1.0)
+            axes.set_yticks(places, [shorten(plain_line(name), LONGEST_NAME) for name in mark.x])
+            axes.set_ylim(len(places) - 0.4, -0.6)
+            continue
+        x = np.asarray(mark.x, float)
+        if mark.kind == "line":
+            axes.plot(x, y, lw=1.2, ls="--" if mark.dashed else "-", **style)
+        elif mark.kind == "band":
+            axes.fill_between(x, low, high, alpha=0.2, lw=0, **style)
         else:
-            _draw_over_x(axes, mark, style)
+            axes.plot(x, y, "o", ms=3.5, **style)
+            if mark.low is not None:
+                axes.vlines(x, low, high, color=colour, lw=1.0)
     axes.set(xlabel=panel.x_label, ylabel=panel.y_label)
     if panel.title:
         axes.set_title(plain_line(panel.title), loc="left")
@@ -129,28 +144,6 @@ def _draw_strip(axes: Axes, mark: Mark, names: dict[str, int], thin: bool) -> No
             axes.fill_between([], [], label=plain_line(name), **style)
     if thin:
         axes.set_yticks([])
-
-
-def _draw_over_x(axes: Axes, mark: Mark, style: dict[str, Any]) -> None:
-    x, y, low, high = (np.asarray(each, float) for each in (mark.x, mark.y, mark.low, mark.high))
-    if mark.kind == "line":
-        axes.plot(x, y, lw=1.2, ls="--" if mark.dashed else "-", **style)
-    elif mark.kind == "band":
-        axes.fill_between(x, low, high, alpha=0.2, lw=0, **style)
-    else:
-        axes.plot(x, y, "o", ms=3.5, **style)
-        if mark.low is not None:
-            axes.vlines(x, low, high, color=style["color"], lw=1.0)
-
-
-def _draw_bars(axes: Axes, mark: Mark, number: int, n_bars: int, style: dict[str, Any]) -> None:
-    height, places = 0.8 / n_bars, np.arange(len(mark.x))
-    at = places + (number - 0.5 * (n_bars - 1)) * height
-    axes.barh(at, np.asarray(mark.y, float), height=0.9 * height, alpha=0.85, **style)
-    if mark.low is not None:
-        axes.hlines(at, np.asarray(mark.low, float), np.asarray(mark.high, float), color=INK, lw=1.0)
-    axes.set_yticks(places, [shorten(plain_line(name), LONGEST_NAME) for name in mark.x])
-    axes.set_ylim(len(places) - 0.4, -0.6)
 
 
 def shorten(text: str, width: int) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -34,26 +35,15 @@ def Band(label: str, x: Any, low: Any, high: Any, colour: int | None = None) -> 
     return Mark("band", label, x, low=low, high=high, colour=colour)
 
 
-def Points(label: str, x: Any, y: Any, low: Any = None, high: Any = None, colour: int | None = None) -> Mark:
-    """Return points ``x, y`` (n,), with bars from ``low`` to ``high`` (n,) where these are given."""
-    return Mark("points", label, x, y, low, high, colour)
+Points = partial(Mark, "points")
+"""Points ``label, x, y``, with bars from ``low`` to ``high`` (n,) where these are given."""
 
+Bars = partial(Mark, "bars")
+"""A horizontal bar for each category, ``label, categories, values``, with an interval ``low, high`` where one is
+given; several are grouped."""
 
-def Bars(
-    label: str,
-    categories: Sequence[str],
-    values: Any,
-    low: Any = None,
-    high: Any = None,
-    colour: int | None = None,
-) -> Mark:
-    """Return a horizontal bar for each category, with an interval where one is given; several are grouped."""
-    return Mark("bars", label, categories, values, low, high, colour)
-
-
-def Strip(intervals: Sequence[Span]) -> Mark:
-    """Return coloured intervals along x; one name has one colour."""
-    return Mark("strip", "", intervals)
+Strip = partial(Mark, "strip", "")
+"""Coloured intervals along x, each a :data:`Span`; one name has one colour."""
 
 
 def spans(time_s: Any, codes: Any, names: Mapping[int, str]) -> list[Span]:
@@ -67,11 +57,11 @@ def spans(time_s: Any, codes: Any, names: Mapping[int, str]) -> list[Span]:
     codes = np.nan_to_num(codes, nan=-99.0)  # no status
     first = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
     ends = [*time_s[first[1:]].tolist(), float(time_s[-1])]
-    return [
-        (float(time_s[i]), end, names[int(codes[i])])
-        for i, end in zip(first, ends, strict=True)
-        if int(codes[i]) in names
-    ]
+    intervals = []
+    for i, end in zip(first, ends, strict=True):
+        if int(codes[i]) in names:
+            intervals.append((float(time_s[i]), end, names[int(codes[i])]))
+    return intervals
 
 
 @dataclass(frozen=True)

@@ -37,33 +37,32 @@ def format_value(value: Any, form: str = "", unit: str = "") -> str:
     ('72.4 to 90.8\xa0%', '0.126\xa0m/s')
     """
     pair = isinstance(value, tuple) and len(value) == 2
-    if pair and not isinstance(value[0], str) and not isinstance(value[1], str):
-        texts = [_bare(0.0 if isinstance(end, float) and abs(end) < TINY else end, form) for end in value]
-    else:
-        texts = [_bare(value, form)]
+    pair = pair and not isinstance(value[0], str) and not isinstance(value[1], str)
+    texts = []
+    for each in value if pair else (value,):
+        if each is None:
+            text = NOT_KNOWN
+        elif isinstance(each, bool):
+            text = "yes" if each else "no"
+        elif isinstance(each, Enum):
+            text = str(each.value)
+        elif isinstance(each, str):
+            text = plain_line(each)
+        else:
+            number = each if isinstance(each, int | float) or not hasattr(each, "item") else each.item()
+            if pair and isinstance(each, float) and abs(each) < TINY:
+                number = 0.0
+            if isinstance(number, float) and not math.isfinite(number):
+                text = NOT_KNOWN if math.isnan(number) else ("∞" if number > 0 else f"{MINUS}∞")
+            elif form:
+                text = f"{number:{form}}".removesuffix("%").replace("-", MINUS)
+            else:
+                text = format_number(number) if isinstance(number, float) else str(number).replace("-", MINUS)
+        texts.append(text)
     if NOT_KNOWN in texts:
         return NOT_KNOWN
     ending = "%" if form.endswith("%") else unit
     return " to ".join(texts) + (f"{NBSP}{ending}" if ending else "")
-
-
-def _bare(value: Any, form: str) -> str:
-    """Return a value without its unit."""
-    if value is None:
-        return NOT_KNOWN
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, Enum):
-        return str(value.value)
-    if isinstance(value, str):
-        return plain_line(value)
-    if not isinstance(value, int | float) and hasattr(value, "item"):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return NOT_KNOWN if math.isnan(value) else ("∞" if value > 0 else f"{MINUS}∞")
-    if form:
-        return f"{value:{form}}".removesuffix("%").replace("-", MINUS)
-    return format_number(value) if isinstance(value, float) else str(value).replace("-", MINUS)
 
 
 def plain_line(text: str) -> str:

@@ -48,8 +48,17 @@ def print_report(report: Report, console: Console | None = None, *, details: boo
     # names come from the user's files: brackets in them are no markup
     width = None if sys.stdout.isatty() else WIDTH_OF_A_FILE
     console = console or Console(soft_wrap=True, markup=False, width=width)
-    for part in _screen(report, details):
-        console.print(part, highlight=False)
+    console.print(RichText(plain_line(report.answer), style="bold"), highlight=False)
+    if report.lead:
+        console.print(RichText(report.lead, style="dim"), highlight=False)
+    _print_parts(console, report.parts)
+    if details:
+        _print_parts(console, report.details)
+    elif report.details:
+        titles = [each.title for each in report.details]
+        console.print(RichText(f"--details adds: {'; '.join(titles)}", style="dim"), highlight=False)
+    if report.next_step:
+        console.print(RichText(f"next: {report.next_step}"), highlight=False)
 
 
 def terminal_text(report: Report, *, details: bool = False, width: int = WIDTH_OF_A_FILE) -> str:
@@ -66,60 +75,43 @@ def terminal_text(report: Report, *, details: bool = False, width: int = WIDTH_O
     return "\n".join(line.rstrip() for line in written.rstrip().splitlines())
 
 
-def _screen(report: Report, details: bool) -> Iterator[RenderableType]:
-    yield RichText(plain_line(report.answer), style="bold")
-    if report.lead:
-        yield RichText(report.lead, style="dim")
-    yield from _parts(report.parts)
-    if details:
-        yield from _parts(report.details)
-    elif report.details:
-        yield RichText(f"--details adds: {'; '.join(each.title for each in report.details)}", style="dim")
-    if report.next_step:
-        yield RichText(f"next: {report.next_step}")
-
-
-def _parts(parts: Sequence[Part]) -> Iterator[RenderableType]:
+def _print_parts(console: Console, parts: Sequence[Part]) -> None:
+    """Print parts; a figure is not drawn on a terminal: pages have it."""
     for part in parts:
+        drawn: RenderableType
         if isinstance(part, Text):
             mark = {"note": "note: ", "warning": "warning: "}.get(part.kind, "")
-            yield RichText(
+            drawn = RichText(
                 mark + (part.text if part.kind == "code" else plain_line(part.text)),
                 style="yellow" if part.kind == "warning" else "",
             )
+            console.print(drawn, highlight=False)
         elif isinstance(part, Table):
-            yield _table(part)
+            drawn = RichTable(
+                title=part.title or None, box=SIMPLE, padding=(0, 1, 0, 0), title_justify="left"
+            )
+            columns = part.written
+            for column, heading, right, *_ in columns:
+                drawn.add_column(
+                    RichText(heading),
+                    justify="right" if right else "left",
+                    overflow="fold",
+                    min_width=24 if column.long else None,
+                )
+            for place in range(len(part.rows)):
+                drawn.add_row(*(RichText(texts[place]) for *_, texts in columns))
+            console.print(drawn, highlight=False)
             if part.note:
-                yield RichText(part.note, style="dim")
+                console.print(RichText(part.note, style="dim"), highlight=False)
         elif isinstance(part, Pairs):
-            yield _pairs(part)
+            drawn = RichTable.grid(padding=(0, 2, 0, 0))
+            drawn.title, drawn.title_justify = part.title or None, "left"
+            for _ in ("name", "value"):
+                drawn.add_column(overflow="fold")
+            for row in part.cells:
+                drawn.add_row(*map(RichText, row))
+            console.print(drawn, highlight=False)
         elif isinstance(part, Section):
             if part.title:
-                yield RichText(f"\n{part.title}", style="bold")
-            yield from _parts(part.parts)
-        # a figure is not drawn on a terminal: pages have it
-
-
-def _table(table: Table) -> RenderableType:
-    drawn = RichTable(title=table.title or None, box=SIMPLE, padding=(0, 1, 0, 0), title_justify="left")
-    columns = table.written
-    for each in columns:
-        drawn.add_column(
-            RichText(each.heading),
-            justify="right" if each.right else "left",
-            overflow="fold",
-            min_width=24 if each.column.long else None,
-        )
-    for texts in zip(*(each.texts for each in columns), strict=True):
-        drawn.add_row(*map(RichText, texts))
-    return drawn
-
-
-def _pairs(pairs: Pairs) -> RenderableType:
-    grid = RichTable.grid(padding=(0, 2, 0, 0))
-    grid.title, grid.title_justify = pairs.title or None, "left"
-    for _ in ("name", "value"):
-        grid.add_column(overflow="fold")
-    for row in pairs.cells:
-        grid.add_row(*map(RichText, row))
-    return grid
+                console.print(RichText(f"\n{part.title}", style="bold"), highlight=False)
+            _print_parts(console, part.parts)

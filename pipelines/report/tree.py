@@ -12,12 +12,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
-from pipelines.report.figure import Figure
 from pipelines.report.numbers import format_value
 from pipelines.report.settings import ENDINGS, check_file
 from terrain.files.atomic import atomic_write
+
+if TYPE_CHECKING:
+    from pipelines.report.figure import Figure
 
 
 class Text(NamedTuple):
@@ -40,16 +42,6 @@ class Column(NamedTuple):
     long: bool = False  #: holds sentences, which are wrapped
 
 
-class Written(NamedTuple):
-    """A column as it is written: numbers are aligned on the right, values are kept for their shade."""
-
-    column: Column
-    heading: str
-    right: bool
-    values: list[Any]
-    texts: list[str]
-
-
 @dataclass(frozen=True)
 class Table:
     """Rows of values, or records, under headings; a heading alone may stand for a :class:`Column`.
@@ -57,10 +49,10 @@ class Table:
     Examples
     --------
     >>> recalls = Table(("terrain", Column("speed", ".1f", "m/s")), [("grass", 0.5), ("ice", None)])
-    >>> [(each.heading, each.right, each.texts) for each in recalls.written]
+    >>> [(heading, right, texts) for _, heading, right, _, texts in recalls.written]
     [('terrain', False, ['grass', 'ice']), ('speed [m/s]', True, ['0.5', '–'])]
     >>> speeds = Column("speed", of=lambda row: row), Column("ahead", of="real")
-    >>> [each.values for each in Table(speeds, [1.5 + 2j]).written]
+    >>> [values for *_, values, _ in Table(speeds, [1.5 + 2j]).written]
     [[(1.5+2j)], [1.5]]
     """
 
@@ -70,18 +62,21 @@ class Table:
     note: str = ""
 
     @property
-    def written(self) -> list[Written]:
-        """The columns as they are written."""
-        found = []
+    def written(self) -> list[tuple[Column, str, bool, list[Any], list[str]]]:
+        """Each column with its heading, whether it is aligned on the right, its values, and these as written."""
+        columns = []
         for place, named in enumerate(self.columns):
             column = named if isinstance(named, Column) else Column(named)
-            values = [value_at(row, place if column.of is None else column.of) for row in self.rows]
-            known = [value for value in values if value is not None]
-            right = bool(column.form) or (bool(known) and not any(isinstance(each, str) for each in known))
+            values, texts, numbers, words = [], [], False, False
+            for row in self.rows:
+                value = value_at(row, place if column.of is None else column.of)
+                values.append(value)
+                texts.append(format_value(value, column.form))
+                numbers |= not (value is None or isinstance(value, str))
+                words |= isinstance(value, str)
             heading = f"{column.title} [{column.unit}]" if column.unit else column.title
-            texts = [format_value(value, column.form) for value in values]
-            found.append(Written(column, heading, right, values, texts))
-        return found
+            columns.append((column, heading, bool(column.form) or (numbers and not words), values, texts))
+        return columns
 
 
 def value_at(record: Any, place: str | int | Callable[[Any], Any]) -> Any:
@@ -124,16 +119,16 @@ class Section:
         return self.given() if callable(self.given) else self.given
 
 
-Part: TypeAlias = Text | Table | Pairs | Figure | Section
+Part: TypeAlias = "Text | Table | Pairs | Figure | Section"
 
 
 def sections(*titled: tuple[str, Sequence[Part | str]]) -> tuple[Section, ...]:
     """Return sections of the details, without those that are empty; a sentence becomes a text."""
-    return tuple(
-        Section(title, tuple(Text(part) if isinstance(part, str) else part for part in parts))
-        for title, parts in titled
-        if parts
-    )
+    found = []
+    for title, parts in titled:
+        if parts:
+            found.append(Section(title, [Text(part) if isinstance(part, str) else part for part in parts]))
+    return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -158,26 +153,26 @@ class Report:
         """
         path = Path(path)
         check_file(path, "--report", ENDINGS)
-        atomic_write(
-            path, _written(self, "pages:markdown_text" if path.suffix.lower() == ".md" else "pages:html_page")
-        )
+        as_markdown = path.suffix.lower() == ".md"
+        atomic_write(path, self._by("pages:markdown_text" if as_markdown else "pages:html_page"))
         return path
 
     def __str__(self) -> str:
-        return _written(self, "terminal:terminal_text")
+        return self._by("terminal:terminal_text")
 
     def _repr_html_(self) -> str:
-        return _written(self, "pages:html_fragment")
+        return self._by("pages:html_fragment")
 
-
-def _written(report: Report, writer: str) -> str:
-    """Return what a function of one of the modules that import this one makes of a report."""
-    text: str = resolve_name(f"pipelines.report.{writer}")(report)
-    return text
+    def _by(self, writer: str) -> str:
+        """Return what a function of one of the modules that import this one makes of the report."""
+        text: str = resolve_name(f"pipelines.report.{writer}")(self)
+        return text
 
 
 def figures_of(report: Report) -> list[Figure]:
     """Return all figures of a report, in their order."""
+    from pipelines.report.figure import Figure
+
     found: list[Figure] = []
     waiting: list[Part | None] = [report.picture, *report.parts, *report.details]
     while waiting:
