@@ -12,11 +12,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 
-import distributed
 import numpy as np
 import psutil
 import pytest
-from distributed.utils import open_port
 
 from features.windows import WindowRule
 from pipelines.learn import parallel as cluster
@@ -86,6 +84,8 @@ def test_no_process_is_left_where_the_command_is_killed(tmp_path):
 @contextmanager
 def quiet_cluster(n_workers):
     """A cluster in this process."""
+    import distributed
+
     here = {"processes": False, "protocol": "tcp", "dashboard_address": None}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -139,6 +139,8 @@ def answers(port):
 @pytest.fixture
 def processes(tmp_path, monkeypatch):
     """A scheduler in a process of its own, on loopback, and what starts workers of it."""
+    from distributed.utils import open_port
+
     monkeypatch.chdir(tmp_path)
     started, port = [], open_port(host="127.0.0.1")
 

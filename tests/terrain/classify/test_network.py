@@ -4,7 +4,6 @@ import sys
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import ShortTimeFFT
@@ -73,6 +72,8 @@ def test_a_network_learns_a_vibration_of_runs_it_never_saw(fitted):
 
 
 def test_the_graph_computes_what_torch_computes():
+    import torch  # takes seconds, which processes without this file do not need
+
     X, y, _ = draw_windows()
     run = np.repeat([0, 1], [96, 24])
     training = Training(COLUMNS, X.astype(np.float32), np.unique(y, return_inverse=True)[1], run)
@@ -91,6 +92,8 @@ def test_the_graph_computes_what_torch_computes():
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_leaves_the_generator_alone(fitted):
+    import torch
+
     X, y, run = draw_windows()
     torch.manual_seed(3)
     before, threads = torch.get_rng_state(), torch.get_num_threads()
