@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -13,8 +14,11 @@ from features.windows import Layout, WindowRule, cut_windows, regular_starts, sp
 from terrain.classify.folds import Fold
 from terrain.classify.metrics import STRIDE_S, Track, last_class, track_of
 from terrain.classify.terrain_filter import check_prior, filter_run, reported
-from terrain.logs.splicing import SplicedRun, parts_under, sequences_of
+from terrain.logs.splicing import order_stretches, parts_under, splice_runs, stretches_of
 from terrain.records import RunLog, Windows
+
+#: A log over several grounds; the run behind each of its labels, and whether it was spliced.
+SplicedRun = tuple[RunLog, tuple[str, ...], bool]
 
 
 def follow(
@@ -57,6 +61,7 @@ def following(
 ) -> Iterator[Callable[[Any], list[Track]]]:
     """Yield, for each fold, what follows the sequences through its held-out runs with a classifier once it is fitted.
 
+    These are one that is spliced of all parts of the runs, each second at most once, and the runs over several grounds.
     ``features`` transforms windows, and learns nothing but their channels and rates; the folds number ``windows``.
     """
     by_id, layout = {run.run_id: run for run in runs}, Layout(windows.channels, windows.rate_hz)
@@ -64,7 +69,14 @@ def following(
     for repeat, number, train, test in folds:
         rng = np.random.default_rng((seed, repeat, number))
         parts = parts_under(by_id, windows[test])
-        sequences = sequences_of(parts, layout.channels, f"course {repeat} {number}", rng)
+        ordered = order_stretches([part for whole in parts for part in stretches_of(whole, rng)], rng)
+        sequences: list[SplicedRun] = []
+        if len(ordered) >= 2:  # else the terrain never changes
+            log = splice_runs(ordered, layout.channels, f"course {repeat} {number}")
+            sequences.append((log, tuple(part.run.run_id for part in ordered), True))
+        for name, n in Counter(part.run.run_id for part in parts).items():
+            if n > 1:  # a run over several grounds
+                sequences.append((by_id[name], (name,) * len(by_id[name].labels), False))
         counts = np.bincount(class_of[train], minlength=len(classes)) + 1.0
         prior = dict(zip(classes.tolist(), (counts / counts.sum()).tolist(), strict=True))
         yield partial(follow, features, sequences, rule, layout, prior)

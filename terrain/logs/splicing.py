@@ -11,7 +11,6 @@ the distance is between half and one and a half periods wherever the run holds s
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -86,27 +85,6 @@ def parts_under(runs: Mapping[str, RunLog], windows: Windows) -> list[Part]:
                 end_s = float(begins_s.max()) + windows.length_s
                 parts.append(Part(runs[name], float(begins_s.min()), end_s, label.terrain))
     return parts
-
-
-SplicedRun = tuple[RunLog, tuple[str, ...], bool]
-"""A log over several grounds; the run behind each of its labels, and whether it was spliced."""
-
-
-def sequences_of(
-    parts: Sequence[Part], channels: Mapping[str, Sequence[str]], run_id: str, rng: np.random.Generator
-) -> tuple[SplicedRun, ...]:
-    """Return a spliced sequence through all parts, each second at most once, and the runs over several grounds.
-
-    None is spliced where the terrain never changes.
-    """
-    found: list[SplicedRun] = []
-    ordered = order_stretches([s for part in parts for s in stretches_of(part, rng)], rng)
-    if len(ordered) >= 2:
-        log = splice_runs(ordered, channels, run_id)
-        found.append((log, tuple(part.run.run_id for part in ordered), True))
-    counts = Counter(part.run.run_id for part in parts)
-    logs = {part.run.run_id: part.run for part in parts if counts[part.run.run_id] > 1}
-    return *found, *((log, (name,) * len(log.labels), False) for name, log in logs.items())
 
 
 def splice_runs(parts: Sequence[Part], channels: Mapping[str, Sequence[str]], run_id: str) -> RunLog:
