@@ -191,7 +191,15 @@ def _keep(runs: Sequence[RunLog], data: Path | None, folder: Path, progress: Pro
 def report(result: QuickstartResult) -> Report:
     """Return the accuracy and what was predicted first; evaluation, training and slip are folded."""
     evaluation, training, predicted = result.crossval.report, result.train.report, result.predict.report
-    slip = [] if result.slip is None else [_slip(result.slip)]
+    slip = []
+    if result.slip is not None:
+        columns = (
+            *("terrain", "runs", Column("slip", "+.3f"), Column("true slip", "+.3f")),
+            *(Column("RMSE", ".4f"), Column("NEES", ".2f")),
+        )
+        table = Table(columns, [tuple(row) for row in result.slip], title="steady slip of the simulated runs")
+        worst = max((row.slip_rmse for row in result.slip if math.isfinite(row.slip_rmse)), default=0.0)
+        slip = [Section(f"Slip, at most {format_value(worst, '.4f')} off", [table])]
     predicted_runs = (
         f"Predictions are those of {enumerated(result.held_out)}, held out: the model was neither trained nor "
         "evaluated on them."
@@ -215,13 +223,3 @@ def report(result: QuickstartResult) -> Report:
         ],
         next_step=result.commands[-3],
     )
-
-
-def _slip(rows: Sequence[TerrainSlip]) -> Section:
-    columns = (
-        *("terrain", "runs", Column("slip", "+.3f"), Column("true slip", "+.3f")),
-        *(Column("RMSE", ".4f"), Column("NEES", ".2f")),
-    )
-    table = Table(columns, [tuple(row) for row in rows], title="steady slip of the simulated runs")
-    worst = max((row.slip_rmse for row in rows if math.isfinite(row.slip_rmse)), default=0.0)
-    return Section(f"Slip, at most {format_value(worst, '.4f')} off", [table])

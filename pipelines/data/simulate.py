@@ -39,18 +39,6 @@ class Settings(BaseSettings):
     """NAME=VALUE of an effect that acts, as wheel_radius=0.03; may be given again."""
 
 
-def _interval(text: str) -> tuple[float, float]:
-    """Read ``START:END``."""
-    start, _, end = text.partition(":")
-    try:
-        start_s, end_s = float(start), float(end)
-    except ValueError:
-        start_s = end_s = 0.0
-    if not 0.0 <= start_s < end_s:
-        raise ConfigError(f"--camera-lost is {text!r}; START:END in seconds is required, as in 10:13")
-    return start_s, end_s
-
-
 class SimulatedRuns(Result):
     """Run folders that were simulated."""
 
@@ -78,7 +66,15 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
     from terrain.terramechanics.soil import load_soil, soil_names
 
     scenario, out = settings.scenario, settings.out
-    camera_lost_s = tuple(_interval(text) for text in settings.camera_lost)
+    camera_lost_s = []
+    for text in settings.camera_lost:
+        try:
+            start_s, end_s = map(float, text.split(":"))
+        except ValueError:
+            start_s = end_s = 0.0
+        if not 0.0 <= start_s < end_s:
+            raise ConfigError(f"--camera-lost is {text!r}; START:END in seconds is required, as in 10:13")
+        camera_lost_s.append((start_s, end_s))
     robot = load_robot(settings.robot)
     effects = read_effects_of(settings.effect, robot.drive)
     ensure_writable(out)
@@ -101,7 +97,7 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
             duration_s=settings.duration_s,
             vary=settings.vary,
             conditions=Conditions(payload_kg=settings.payload_kg, grade_ratio=(gradient, 0.0)),
-            faults=Faults(camera_lost_s=camera_lost_s),
+            faults=Faults(camera_lost_s=tuple(camera_lost_s)),
             gnss=Gnss() if settings.gnss else None,
             effects=effects,
         )

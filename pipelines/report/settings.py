@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -136,13 +137,8 @@ def _one_sentence(model: type[Settings], error: ValidationError) -> str:
         return f"there is no setting {name!r}"
     if first["type"] == "missing":
         return f"{name} is missing"
-    return f"{model.model_fields[name].alias} is {_shown(given)}: {message[:1].lower()}{message[1:]}"
-
-
-def _shown(given: Any) -> str:
-    """Return what was given: numbers, also those of the command line, as they are, and texts in quotes."""
-    try:
+    shown = repr(given)
+    with suppress(TypeError, ValueError):  # numbers, also those of the command line, are without quotes
         float(given)
-    except (TypeError, ValueError):
-        return repr(given)
-    return str(given)
+        shown = str(given)
+    return f"{model.model_fields[name].alias} is {shown}: {message[:1].lower()}{message[1:]}"

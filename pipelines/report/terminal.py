@@ -47,18 +47,18 @@ def print_report(report: Report, console: Console | None = None, *, details: boo
     """Print a report: its answer, what is decided by, and with ``details`` all of it; on stdout by default."""
     # names come from the user's files: brackets in them are no markup
     width = None if sys.stdout.isatty() else WIDTH_OF_A_FILE
-    console = console or Console(soft_wrap=True, markup=False, width=width)
-    console.print(RichText(plain_line(report.answer), style="bold"), highlight=False)
+    console = console or Console(soft_wrap=True, markup=False, highlight=False, width=width)
+    console.print(RichText(plain_line(report.answer), style="bold"))
     if report.lead:
-        console.print(RichText(report.lead, style="dim"), highlight=False)
+        console.print(RichText(report.lead, style="dim"))
     _print_parts(console, report.parts)
     if details:
         _print_parts(console, report.details)
     elif report.details:
         titles = [each.title for each in report.details]
-        console.print(RichText(f"--details adds: {'; '.join(titles)}", style="dim"), highlight=False)
+        console.print(RichText(f"--details adds: {'; '.join(titles)}", style="dim"))
     if report.next_step:
-        console.print(RichText(f"next: {report.next_step}"), highlight=False)
+        console.print(RichText(f"next: {report.next_step}"))
 
 
 def terminal_text(report: Report, *, details: bool = False, width: int = WIDTH_OF_A_FILE) -> str:
@@ -69,10 +69,12 @@ def terminal_text(report: Report, *, details: bool = False, width: int = WIDTH_O
     >>> terminal_text(Report("Runs", "Half of them are right.", parts=[Pairs([("runs", 3)])])).split()[-2:]
     ['runs', '3']
     """
-    console = Console(file=io.StringIO(), width=width, markup=False, soft_wrap=True, color_system=None)
+    file = io.StringIO()
+    console = Console(
+        file=file, width=width, soft_wrap=True, markup=False, highlight=False, color_system=None
+    )
     print_report(report, console, details=details)
-    written: str = console.file.getvalue()  # type: ignore[attr-defined]
-    return "\n".join(line.rstrip() for line in written.rstrip().splitlines())
+    return "\n".join(line.rstrip() for line in file.getvalue().rstrip().splitlines())
 
 
 def _print_parts(console: Console, parts: Sequence[Part]) -> None:
@@ -85,7 +87,7 @@ def _print_parts(console: Console, parts: Sequence[Part]) -> None:
                 mark + (part.text if part.kind == "code" else plain_line(part.text)),
                 style="yellow" if part.kind == "warning" else "",
             )
-            console.print(drawn, highlight=False)
+            console.print(drawn)
         elif isinstance(part, Table):
             drawn = RichTable(
                 title=part.title or None, box=SIMPLE, padding=(0, 1, 0, 0), title_justify="left"
@@ -100,9 +102,9 @@ def _print_parts(console: Console, parts: Sequence[Part]) -> None:
                 )
             for place in range(len(part.rows)):
                 drawn.add_row(*(RichText(texts[place]) for *_, texts in columns))
-            console.print(drawn, highlight=False)
+            console.print(drawn)
             if part.note:
-                console.print(RichText(part.note, style="dim"), highlight=False)
+                console.print(RichText(part.note, style="dim"))
         elif isinstance(part, Pairs):
             drawn = RichTable.grid(padding=(0, 2, 0, 0))
             drawn.title, drawn.title_justify = part.title or None, "left"
@@ -110,8 +112,8 @@ def _print_parts(console: Console, parts: Sequence[Part]) -> None:
                 drawn.add_column(overflow="fold")
             for row in part.cells:
                 drawn.add_row(*map(RichText, row))
-            console.print(drawn, highlight=False)
+            console.print(drawn)
         elif isinstance(part, Section):
             if part.title:
-                console.print(RichText(f"\n{part.title}", style="bold"), highlight=False)
+                console.print(RichText(f"\n{part.title}", style="bold"))
             _print_parts(console, part.parts)

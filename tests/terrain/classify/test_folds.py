@@ -87,7 +87,9 @@ def test_enough_is_left_of_every_terrain(make_run):
         ({"ice": 2, "mud": 2, "sand": 2}, []),
         ({}, []),
     ):
-        runs = [make_run(f"{name}_{i}", name, i, duration_s=1.0) for name, n in counts.items() for i in range(n)]
+        runs = [
+            make_run(f"{name}_{i}", name, i, duration_s=1.0) for name, n in counts.items() for i in range(n)
+        ]
         training, out = hold_out_runs(runs)
         assert [each.run_id for each in out] == held_out
         assert sorted(each.run_id for each in (*training, *out)) == sorted(each.run_id for each in runs)
