@@ -416,8 +416,12 @@ def values_by_run(
     precision = np.where(seen, 1.0 / (noise / np.where(seen, total, 1.0) + assumed_std**2), 0.0)
     # one run that is far out is no variation from run to run: the others have to differ as well
     known = np.flatnonzero(seen)
-    rests = [np.delete(known, i) for i in range(len(known))]
-    likelihood = min([_likelihood_ratio(value[rest], precision[rest]) for rest in rests])
+    likelihood = math.inf  # that a scatter of their own gains, twice its logarithm
+    for rest in [np.delete(known, i) for i in range(len(known))]:
+        variance = 1.0 / precision[rest] + (SCATTERS[:, None] * np.ptp(value[rest])) ** 2
+        middle = (value[rest] / variance).sum(axis=1) / (1.0 / variance).sum(axis=1)
+        loss = (np.log(variance) + (value[rest] - middle[:, None]) ** 2 / variance).sum(axis=1)
+        likelihood = min(likelihood, float(loss[0] - loss.min()))
     z = z_of_t(math.sqrt(max(likelihood, 0.0)), TRUST_DOF + dof)
     # squares about the mean, in variances, those far out limited
     square = precision * (value - (precision * value).sum() / precision.sum()) ** 2
@@ -425,14 +429,6 @@ def values_by_run(
     beyond = float(square.sum()) - (len(known) - 1)
     spread = float(precision.sum() - (precision**2).sum() / precision.sum())
     return RunValues(name, value + mean, precision, math.sqrt(max(beyond / spread, 0.0) + assumed_std**2), z)
-
-
-def _likelihood_ratio(value: Array, precision: Array) -> float:
-    """Return the fall of minus twice the log-likelihood where values have a scatter of their own."""
-    variance = 1.0 / precision + (SCATTERS[:, None] * np.ptp(value)) ** 2
-    mean = (value / variance).sum(axis=1) / (1.0 / variance).sum(axis=1)
-    loss = (np.log(variance) + (value - mean[:, None]) ** 2 / variance).sum(axis=1)
-    return float(loss[0] - loss.min())
 
 
 def _two_groups(best: RunValues, run_ids: Sequence[str]) -> tuple[verdict.RunGroup, ...]:

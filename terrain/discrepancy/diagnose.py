@@ -40,9 +40,14 @@ ENTANGLED = 0.97
 
 POWER_Z = 1.28  #: Added to the threshold, so that nine in ten are detected
 
+REST_MPS = 0.02  #: Fastest that a wheel turns, by its sensor's noise, in a run that does not drive
+
 
 def diagnose(
-    runs: Sequence[RunLog], simulation: Simulation, library: Sequence[Effect] | None = None
+    runs: Sequence[RunLog],
+    simulation: Simulation,
+    library: Sequence[Effect] | None = None,
+    signals: Sequence[Signals] | None = None,
 ) -> verdict.Diagnosis:
     """Return what a simulation gets wrong about measured runs.
 
@@ -51,21 +56,48 @@ def diagnose(
     runs : of the simulation's robot, three at the least
     simulation : under test, with the effects that are built in already
     library : effects that may be named; all that apply to the robot by default
+    signals : of the runs on one clock each, where they are known already
 
     Raises
     ------
     DataError
         if runs are of another robot, too few, of one id, or too short, or have no channel in common with the
-        simulation, or if too few are consistent with each other.
+        simulation, if too few are consistent with each other, or if their clocks are further apart than is searched.
     """
     ids = Counter([run.run_id for run in runs])
     if twice := [run_id for run_id, n in ids.items() if n > 1]:
         raise DataError(f"runs: {twice[0]!r} is the id of {ids[twice[0]]} runs; each needs its own")
     if len(runs) < MIN_RUNS:
         raise DataError(f"runs: there are {len(runs)}, at least {MIN_RUNS} are required, to hold some out")
-    signals = [signals_of(run, simulation.robot) for run in runs]
+    signals = [signals_of(run, simulation.robot) for run in runs] if signals is None else signals
     effects = simulation.library if library is None else tuple(library)
-    prepared, faults, excluded, seeds, aligned, shift = prepare(signals, simulation, effects)
+
+    # faults are repaired, lags that a search has to start from are known, and unfit runs are excluded
+    low_pass, known = low_pass_of(signals), names_of(effects)
+    plain = [
+        rows_of(run, simulation.planar_on(run.terrain), simulation.vector, (), low_pass) for run in signals
+    ]
+    latencies = latencies_of(signals, simulation)
+    faults = faults_of(signals, plain, simulation, low_pass, latencies)
+    fit_runs, checked = repaired(signals, faults), False
+    excluded: tuple[Excluded, ...] = ()
+    if faults:
+        latencies = latencies_of(fit_runs, simulation)
+    while True:
+        prepared = Problem(fit_runs, simulation, low_pass, effects)
+        seeds = {name: value for name, value in latencies.starting_values.items() if name in known}
+        aligned = prepared.at(move_point(simulation.vector, [*seeds], [*seeds.values()]))
+        shift = shifts_of(aligned)
+        if checked or not (excluded := unfit_runs(fit_runs, aligned, shift)):
+            break
+        unfit, checked = {run.run_id for run in excluded}, True
+        fit_runs = tuple([run for run in fit_runs if run.run_id not in unfit])
+        if len(fit_runs) < MIN_RUNS:
+            why = "; ".join([f"{run.run_id}: {run.reason}" for run in excluded[:3]])
+            raise DataError(f"runs: only {len(fit_runs)} of {len(signals)} are fit to be compared ({why})")
+        latencies = latencies_of(fit_runs, simulation)
+    if not any(np.nanmax(np.abs(run.wheel_speed_mps), initial=0.0) > REST_MPS for run in fit_runs):
+        raise DataError(f"runs: in all {len(fit_runs)} the wheels are at rest; runs that drive are required")
 
     # causes, their values and what they leave
     problem = constancy.with_conditions(prepared, aligned)
@@ -92,7 +124,12 @@ def diagnose(
             ratio = min(probe.gain / float(power[CHANNELS.index(channel)]), 1.0)
             best[channel] = verdict.Unexplained(channel, name, probe.z, ratio)
     for out in withdrawn.values():
-        channel = shown_beside(fit, effect_named(out.name))
+        # where it shows most while the causes are fitted with it: a wheel radius beside an effective track shows in
+        # the speed alone, as the track takes what it does to the yaw rate
+        own, base = _own_and_base(fit, effect_named(out.name))
+        weights = np.eye(len(fit.info.names))[own]
+        weights[:, base] = -partial_information(fit.info.a.sum(axis=0), base, own)[0].T
+        channel = CHANNELS[int(np.argmax(fit.info.channel_power(weights)))]
         if channel not in best and out.name not in varies:
             best[channel] = verdict.Unexplained(channel, out.name, out.z, 0.0)
     unexplained = tuple(sorted(best.values(), key=lambda left: -left.z))
@@ -118,6 +155,30 @@ def diagnose(
     at = [fit.names.index(name) for name in parameters]
     inflation = np.array([fit.tests[effect.name].inflation for effect in named for _ in effect.parameters])
     cov = fit.cov[np.ix_(at, at)] * np.sqrt(np.outer(inflation, inflation))
+
+    causes, size = [], float(fit.info.c.sum())
+    for effect in named:
+        test, parameter = fit.tests[effect.name], effect.parameters[0]
+        low, high = test.gain_interval
+        caveat = constancy_of_cause(fit, effect).caveat
+        caveats = [caveat] if caveat else []
+        scatter = constancy.run_scatter(problem, fit, parameter.name)
+        value = float(fit.change[fit.names.index(parameter.name)])
+        if len(effect.parameters) == 1 and scatter > constancy.CAVEAT_RATIO * abs(value):
+            unit = UNITS.get(parameter.unit, parameter.unit)
+            caveats.append(f"it differs from run to run by {scatter:.2g} {unit}".strip())
+        cause = verdict.Cause(
+            name=effect.name,
+            aliases=effect.aliases,
+            parameters=values[effect.name],
+            held_out_gain=float(test.gain.sum()) / size,
+            gain_ci=(low / size, high / size),
+            channels=shown_channels(fit, effect),
+            z=test.z,
+            dispersion=test.dispersion,
+            caveat="; ".join(caveats),
+        )
+        causes.append(cause)
 
     # what could not have been detected beside it, and what is not the answer
     limits, a = [], fit.info.a.sum(axis=0)
@@ -163,7 +224,7 @@ def diagnose(
     return verdict.Diagnosis(
         robot=simulation.robot.name,
         verdict=next(name for name, holds in verdicts.items() if holds),
-        causes=tuple([cause_of(problem, fit, effect) for effect in named]),
+        causes=tuple(causes),
         covariance=verdict.Covariance(parameters, cov),
         ambiguous_sets=tuple(sets),
         ambiguous_values={name: values[name] for names in sets for name in names},
@@ -262,18 +323,6 @@ def shown_channels(fit: CauseFit, cause: Effect) -> tuple[str, ...]:
     power = fit.info.channel_power(weights)
     order = np.argsort(-power)
     return tuple([CHANNELS[i] for i in order if power[i] > 0.1 * power[order[0]]])
-
-
-def shown_beside(fit: CauseFit, effect: Effect) -> str:
-    """Return the channel in which an effect shows most while the causes are fitted with it.
-
-    A wheel radius beside an effective track shows in the speed alone: the track takes what it does to the
-    yaw rate.
-    """
-    own, base = _own_and_base(fit, effect)
-    weights = np.eye(len(fit.info.names))[own]
-    weights[:, base] = -partial_information(fit.info.a.sum(axis=0), base, own)[0].T
-    return CHANNELS[int(np.argmax(fit.info.channel_power(weights)))]
 
 
 def raw_gain(fit: CauseFit, cause: Effect) -> float:
@@ -388,58 +437,6 @@ def channel_effects(fit: CauseFit, cause: Effect) -> dict[str, tuple[float, floa
     return {name: (a, b, gain) for name, a, b, gain in of_channels if b > 0}
 
 
-# -- What is done to runs before causes are searched: faults repaired, lags known, unfit runs excluded -----
-
-REST_MPS = 0.02  #: Fastest that a wheel turns, by its sensor's noise, in a run that does not drive
-
-Prepared = tuple[Problem, tuple[Fault, ...], tuple[Excluded, ...], dict[str, float], Evidence, Shift]
-
-
-def prepare(signals: Sequence[Signals], simulation: Simulation, library: Sequence[Effect]) -> Prepared:
-    """Return the problem of the runs that are fit to be compared, and what was found out about all of them.
-
-    Returns
-    -------
-    problem : of the fit runs, faults repaired
-    faults : that were found and repaired, in all runs that were given
-    excluded : runs that are unfit
-    seeds : lags of sensors, by parameter, so large that a search has to start from them
-    aligned : evidence of the runs with these lags built in
-    shift : clocks of the runs behind that
-
-    Raises
-    ------
-    DataError
-        if too few runs are fit, or their clocks are further apart than is searched.
-    """
-    low_pass, known = low_pass_of(signals), names_of(library)
-    plain = [
-        rows_of(run, simulation.planar_on(run.terrain), simulation.vector, (), low_pass) for run in signals
-    ]
-    latencies = latencies_of(signals, simulation)
-    faults = faults_of(signals, plain, simulation, low_pass, latencies)
-    runs, checked = repaired(signals, faults), False
-    excluded: tuple[Excluded, ...] = ()
-    if faults:
-        latencies = latencies_of(runs, simulation)
-    while True:
-        problem = Problem(runs, simulation, low_pass, tuple(library))
-        seeds = {name: value for name, value in latencies.starting_values.items() if name in known}
-        aligned = problem.at(move_point(simulation.vector, [*seeds], [*seeds.values()]))
-        shift = shifts_of(aligned)
-        if checked or not (excluded := unfit_runs(runs, aligned, shift)):
-            break
-        unfit, checked = {run.run_id for run in excluded}, True
-        runs = tuple([run for run in runs if run.run_id not in unfit])
-        if len(runs) < MIN_RUNS:
-            reasons = "; ".join([f"{run.run_id}: {run.reason}" for run in excluded[:3]])
-            raise DataError(f"runs: only {len(runs)} of {len(signals)} are fit to be compared ({reasons})")
-        latencies = latencies_of(runs, simulation)
-    if not any(np.nanmax(np.abs(run.wheel_speed_mps), initial=0.0) > REST_MPS for run in runs):
-        raise DataError(f"runs: in all {len(runs)} the wheels are at rest; runs that drive are required")
-    return problem, faults, excluded, seeds, aligned, shift
-
-
 # -- What a diagnosis states of what was found ---------------------------------------------------------------
 
 
@@ -452,30 +449,6 @@ def values_of(fit: CauseFit, effect: Effect) -> tuple[verdict.Value, ...]:
 def _values(effect: Effect, change: Array, std: Array) -> tuple[verdict.Value, ...]:
     numbers = zip(effect.parameters, change.tolist(), (verdict.INTERVAL_T * std).tolist(), strict=True)
     return tuple([verdict.Value(p.name, x, p.unit, x - half, x + half) for p, x, half in numbers])
-
-
-def cause_of(problem: Problem, fit: CauseFit, effect: Effect) -> verdict.Cause:
-    """Return what is stated of a cause that is named."""
-    test, size = fit.tests[effect.name], float(fit.info.c.sum())
-    low, high = test.gain_interval
-    caveat, parameter = constancy_of_cause(fit, effect).caveat, effect.parameters[0]
-    caveats = [caveat] if caveat else []
-    scatter = constancy.run_scatter(problem, fit, parameter.name)
-    value = float(fit.change[fit.names.index(parameter.name)])
-    if len(effect.parameters) == 1 and scatter > constancy.CAVEAT_RATIO * abs(value):
-        unit = UNITS.get(parameter.unit, parameter.unit)
-        caveats.append(f"it differs from run to run by {scatter:.2g} {unit}".strip())
-    return verdict.Cause(
-        name=effect.name,
-        aliases=effect.aliases,
-        parameters=values_of(fit, effect),
-        held_out_gain=float(test.gain.sum()) / size,
-        gain_ci=(low / size, high / size),
-        channels=shown_channels(fit, effect),
-        z=test.z,
-        dispersion=test.dispersion,
-        caveat="; ".join(caveats),
-    )
 
 
 def residuals_of(info: Evidence, start: Evidence) -> dict[str, verdict.Residual]:

@@ -100,13 +100,14 @@ def diagnose_runs(
     """
     runs = [with_wheel_speeds(run, robot) for run in sorted(runs, key=lambda run: run.run_id)]
     used, held_out = split_runs(runs, hold_out, seed)
-    simulation, terrains = simulation_for(used, robot, library)
-    diagnosis = diagnose(used, simulation, library)
+    every = {run.run_id: signals_of(run, robot) for run in used}
+    simulation, terrains = simulation_for(used, robot, library, [*every.values()])
+    diagnosis = diagnose(used, simulation, library, [*every.values()] if len(every) == len(used) else None)
     # ambiguous sets are left out: which of their effects acts is not known
     extended = simulation.with_effects(diagnosis.values) if diagnosis.causes else None
     excluded = {run.run_id for run in diagnosis.excluded_runs}
     fit = tuple(run for run in used if run.run_id not in excluded)
-    signals = repaired([signals_of(run, robot) for run in fit], diagnosis.faults)
+    signals = repaired([every[run.run_id] for run in fit], diagnosis.faults)
     low_pass = low_pass_of(signals)
     compared = compare_runs(simulation, extended, signals, low_pass)
     last = extended or simulation
@@ -232,14 +233,18 @@ TILT_LOSS = 20.0
 
 
 def simulation_for(
-    runs: Sequence[RunLog], robot: Robot, library: Sequence[Effect]
+    runs: Sequence[RunLog],
+    robot: Robot,
+    library: Sequence[Effect],
+    signals: Sequence[Signals] | None = None,
 ) -> tuple[Simulation, tuple[TerrainMatch, ...]]:
     """Return the simulation of runs, and the terrain that each of their labels is simulated on.
 
     A label that is the name of a soil of the package is simulated on that soil, all others on the default terrain.  On
     soils the simulation has an error of its own, and a part of the measured tilt acts as a slope: a tilt that is none,
     of a body that rides over bumps, takes no traction; simulated as a slope it biases mass, resistance and slip.  The
-    runs fit best with the part that acts, all parameters of the library freed.
+    runs fit best with the part that acts, all parameters of the library freed.  The ``signals`` of the runs are taken
+    where they are known already.
     """
     labels = sorted({run.terrains[0] if len(run.terrains) == 1 else "" for run in runs})
     known, grounds = {*soil_names(), *extra_soil_names()}, {}
@@ -253,7 +258,8 @@ def simulation_for(
         for kind in ("model_error", "varied_error", "varied_scatter"):
             errors[kind] = {n: size for n, size in spread_numbers(kind).items() if n in parameters}
         simulation = replace(simulation, **errors)
-    signals = [signals_of(run, robot) for run in runs] if grounds else []
+    if signals is None:
+        signals = [signals_of(run, robot) for run in runs] if grounds else []
     for label, ground in list(grounds.items()):
         own = [run for run in signals if run.terrain == label]
         if not own:
