@@ -23,6 +23,7 @@ from terrain.discrepancy.evidence import (
     TRUST_DOF,
     Evidence,
     clustered_variance,
+    marginal,
     marginal_parts,
     z_of_t,
 )
@@ -83,9 +84,23 @@ def constancy_of(
     others = [name for name in names if name not in own]
     values, std, ratio, split, certain = {}, {}, 0.0, "time", False
     size = float(np.linalg.norm(change[[list(names).index(name) for name in own]]))
+    p, q = len(own), info.nuisances.size
     for kind, group in where.items():
-        values[kind], cov = info.fit_groups(own, others, group)
-        cov = inflation * cov
+        # a column for each parameter in each group, the others in common, what varies from run to run marginalised
+        n_groups = int(group.max()) + 1
+        m = n_groups * p
+        design = np.zeros((*group.shape, len(info.names) + 1, q + m + len(others) + 1))
+        design[:, :, info.nuisances, np.arange(q)] = 1.0
+        design[:, :, info.places(others), np.arange(q + m, q + m + len(others))] = 1.0
+        design[:, :, -1, -1] = 1.0
+        for (i, b), k in np.ndenumerate(group):
+            design[i, b, info.places(own), np.arange(q + k * p, q + (k + 1) * p)] = 1.0
+        columns = design.transpose(0, 1, 3, 2) @ info.grams @ design
+        free = marginal(columns, np.arange(q), info.nuisance_std)[0][:, q:, q:].sum(axis=0)
+        inverse = np.linalg.pinv(free[:-1, :-1], hermitian=True, rcond=1e-12)
+        shown = np.diag(free)[:m] > 1e-9 * np.diag(free)[:m].max()
+        values[kind] = np.where(shown, (inverse @ free[:-1, -1])[:m], np.nan).reshape(n_groups, p)
+        cov = inflation * inverse[:m, :m].reshape(n_groups, p, n_groups, p)
         variance = np.einsum("gpgp->gp", cov)
         std[kind] = np.where(np.isfinite(values[kind]), np.sqrt(np.maximum(variance, 0.0)), np.nan)
         apart, beyond = _difference(values[kind], cov)

@@ -15,9 +15,9 @@ from itertools import combinations
 import numpy as np
 
 from terrain.discrepancy import constancy, verdict
-from terrain.discrepancy.clocks import Shift, latencies_of, shifts_of
+from terrain.discrepancy.clocks import latencies_of, shifts_of
 from terrain.discrepancy.evidence import EXCITED_RATIO, Z_EFFECT, Evidence, move_point, partial_information
-from terrain.discrepancy.health import Excluded, Fault, clocks_of, faults_of, repaired, unfit_runs
+from terrain.discrepancy.health import Excluded, clocks_of, faults_of, repaired, unfit_runs
 from terrain.discrepancy.next_drive import MOST, next_drive
 from terrain.discrepancy.probes import TILT_INPUTS, ProbeResult, probe_residuals
 from terrain.discrepancy.robot_terms import UNITS
@@ -209,8 +209,8 @@ def diagnose(
             reason = "it is not significant beside what was found"
         else:
             reason = "it does not reduce the residual of runs left out, or differs from run to run"
-        own = values[effect.name] if effect in fit.causes else ()
-        ruled_out.append(verdict.RuledOut(effect.name, reason, test.z, own))
+        of_cause = values[effect.name] if effect in fit.causes else ()
+        ruled_out.append(verdict.RuledOut(effect.name, reason, test.z, of_cause))
     verdicts = {
         Verdict.AMBIGUOUS: sets,
         Verdict.EXPLAINED: named,

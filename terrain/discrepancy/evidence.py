@@ -157,27 +157,6 @@ class Evidence:
         a, g = self.total(names)
         return -float(g @ np.linalg.lstsq(a, g, rcond=1e-10)[0]) if len(names) else 0.0
 
-    def fit_groups(self, own: Sequence[str], others: Sequence[str], where: Array) -> tuple[Array, Array]:
-        """Fit parameters in each group of the data, others in common, what varies from run to run marginalised.
-
-        ``where`` (runs, N_BLOCKS) is the group of each third of each run.  Returned are values (groups, p), NaN
-        where a group shows nothing, and their covariance (groups, p, groups, p) by the noise.
-        """
-        n_groups, p, q = int(where.max()) + 1, len(own), self.nuisances.size
-        m = n_groups * p
-        design = np.zeros((*where.shape, len(self.names) + 1, q + m + len(others) + 1))
-        design[:, :, self.nuisances, np.arange(q)] = 1.0
-        design[:, :, self.places(others), np.arange(q + m, q + m + len(others))] = 1.0
-        design[:, :, -1, -1] = 1.0
-        for (i, b), group in np.ndenumerate(where):
-            design[i, b, self.places(own), np.arange(q + group * p, q + (group + 1) * p)] = 1.0
-        columns = design.transpose(0, 1, 3, 2) @ self.grams @ design
-        free = marginal(columns, np.arange(q), self.nuisance_std)[0][:, q:, q:].sum(axis=0)
-        cov = np.linalg.pinv(free[:-1, :-1], hermitian=True, rcond=1e-12)
-        shown = np.diag(free)[:m] > 1e-9 * np.diag(free)[:m].max()
-        values = np.where(shown, (cov @ free[:-1, -1])[:m], np.nan).reshape(n_groups, p)
-        return values, cov[:m, :m].reshape(n_groups, p, n_groups, p)
-
     def fits_without_each(self, at: Sequence[int]) -> Array:
         """Return the change (runs, n) of parameters at some places that fits all runs but each of them."""
         a, g = self.clusters(at)
@@ -262,7 +241,18 @@ def evidence_at(
         shown = shift.shape[0] * shift.shape[1] - (np.einsum("iqq->iq", inner) / loose.nuisance_std**2).sum()
         n_fitted = float(np.trace(np.linalg.solve(loose.freed, loose.a.sum(axis=0)))) + float(shown)
         noise = noise_of(left, speeds, row_s, n_fitted, orders)
-    _take_out_probes(rows, loose.noise, left)
+    # what a constant, the speed, the turn and their product explain in all runs alike is no noise
+    drives = [run.inputs[:, :2].T for run in rows]
+    probes = [np.column_stack([np.ones_like(u), u, turn, u * turn]) for u, turn in drives]
+    size = np.concatenate([loose.noise.size(pace_mps) for pace_mps in speeds])
+    every, value = np.concatenate(probes), np.concatenate(left)
+    for c in range(value.shape[1]):
+        shows = np.isfinite(value[:, c] / size[:, c])
+        if shows.sum() > 10 * N_PROBES:
+            weighted = every[shows] / size[shows, c : c + 1]
+            fit = np.linalg.lstsq(weighted, value[shows, c] / size[shows, c], rcond=1e-10)[0]
+            for residual, driven in zip(left, probes, strict=True):
+                residual[:, c] -= driven @ fit
     plain = noise_of(left, speeds, row_s, n_fitted + len(CHANNELS) * N_PROBES, ORDERS)
     return whitened(noise._replace(std=plain.std), varies)
 
@@ -287,24 +277,6 @@ def whiten_run(noise: Noise, run: Rows) -> Array:
         valid[:lag] &= ~used
     both = np.concatenate([run.sensitivity, residual[None]]) / noise.size(run.pace_mps)
     return np.asarray(whiten(noise.filters, both) * valid)
-
-
-def _take_out_probes(rows: Sequence[Rows], noise: Noise, left: Sequence[Array]) -> None:
-    """Take off residuals (rows, channels), in place, what a few probes explain in all runs alike.
-
-    A constant, the speed, the turn and their product: what the library does not have is no noise.
-    """
-    drives = [run.inputs[:, :2].T for run in rows]
-    probes = [np.column_stack([np.ones_like(u), u, turn, u * turn]) for u, turn in drives]
-    size = np.concatenate([noise.size(run.pace_mps) for run in rows])
-    every, value = np.concatenate(probes), np.concatenate(left)
-    for c in range(value.shape[1]):
-        known = np.isfinite(value[:, c] / size[:, c])
-        if known.sum() > 10 * N_PROBES:
-            weighted = every[known] / size[known, c : c + 1]
-            fit = np.linalg.lstsq(weighted, value[known, c] / size[known, c], rcond=1e-10)[0]
-            for residual, columns in zip(left, probes, strict=True):
-                residual[:, c] -= columns @ fit
 
 
 def partial_information(a: Array, base: Sequence[int], own: Sequence[int]) -> tuple[Array, Array]:
