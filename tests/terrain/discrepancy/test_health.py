@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from studies.blind_trials.drives import rich_drives
-from studies.blind_trials.trial import hidden_runs, simulation_of
+from studies.blind_trials.trial import hidden_runs, simulation_of, with_late_streams
 
 from pipelines.data.datasets import load_runs
 from terrain.discrepancy.clocks import latencies_of, shifts_of
@@ -102,17 +102,6 @@ def times(factor):
 
 def exchanged(_, values):
     return values[:, ::-1]
-
-
-def late(late_s, *names):
-    """Return what stamps streams of a run late."""
-
-    def moved(run):
-        own = {name: run.streams[name] for name in names}
-        own = {name: replace(stream, time_s=stream.time_s + late_s) for name, stream in own.items()}
-        return replace(run, streams={**run.streams, **own})
-
-    return moved
 
 
 # -- Faults of columns, in all runs or in some -----------------------------------------------------------------
@@ -300,8 +289,8 @@ def test_a_reading_mends_no_channel_that_a_run_does_not_show():
 # -- Runs that are unfit ------------------------------------------------------------------------------------
 
 SAND = Ground(1.2, 0.35, 0.15, 0.3)
-ODD = 2
-"""Which of the runs has the fault."""
+ODD, OTHERS = 2, ("imu", "odometry")
+"""Which of the runs has the fault, and the streams of the logger that is not the wheels'."""
 
 
 def drive(robot=HUSKY, seed=0, name="survey", ground=None, **options):
@@ -348,7 +337,7 @@ def test_an_effect_common_to_all_runs_makes_none_unfit(excluded, robot, effects)
 
 def test_a_clock_offset_of_one_run_is_found_to_a_hundredth_of_a_second(six_runs, evidence):
     offset_s = [0.84 if i == ODD else 0.02 for i in range(6)]
-    runs = [late(by_s, "imu", "odometry")(run) for run, by_s in zip(six_runs, offset_s, strict=True)]
+    runs = [with_late_streams([run], OTHERS, by_s)[0] for run, by_s in zip(six_runs, offset_s, strict=True)]
     signals, info = evidence(runs)
     shift = shifts_of(info)
     unfit, clocks = unfit_runs(signals, info), clocks_of(info, shift)
@@ -360,14 +349,12 @@ def test_a_clock_offset_of_one_run_is_found_to_a_hundredth_of_a_second(six_runs,
     assert all(0 < clock.std_s < 0.01 for clock in clocks)
     assert unfit_runs(signals, info, shift) == unfit  # clocks that are known are taken
     # a clock out of the search excludes a run, and is refused for most runs
-    far = late(5.0, "imu", "odometry")
-    ((run_id, reason),) = unfit_runs(
-        *evidence([far(run) if i == ODD else run for i, run in enumerate(six_runs)])
-    )
+    far = with_late_streams(six_runs, OTHERS, 5.0)
+    ((run_id, reason),) = unfit_runs(*evidence([*six_runs[:ODD], far[ODD], *six_runs[ODD + 1 :]]))
     assert run_id == f"run_{ODD}"
     assert "not -1 to 2 s behind" in reason
     with pytest.raises(DataError, match="unsynchronised clocks beyond the search in 3 of 3"):
-        unfit_runs(*evidence([far(run) for run in six_runs[:3]]))
+        unfit_runs(*evidence(far[:3]))
 
 
 MOTION = {"imu": "gyro_z", "odometry": "speed_"}
@@ -529,10 +516,10 @@ def test_what_is_late_is_found_in_both_signs_and_a_sensor_is_distinguished_from_
         (runs, ["odometry"], 0.3, {"camera_latency_s": 0.3}),
         (lidar, ["imu"], 0.3, {"imu_latency_s": 0.3}),
     ):
-        found = latencies([late(late_s, *streams)(run) for run in given])
+        found = latencies(with_late_streams(given, streams, late_s))
         assert found.starting_values == pytest.approx(expected, abs=0.025), streams
         assert list(found.channels)[:2] == [GYRO, SPEED_X]
-    alone = latencies([late(0.3, "imu")(run) for run in runs])  # or it turns late
+    alone = latencies(with_late_streams(runs, ["imu"], 0.3))  # or it turns late
     assert "imu_latency_s" not in alone.starting_values
     few = latencies(runs[:2])
     assert (few.channels, few.starting_values) == ({}, {})
@@ -542,7 +529,7 @@ def test_short_runs_of_a_wrong_simulation_measure_clocks_together():
     runs = rich_runs(n=40, duration_s=8.0, effects=WIDE)
     rng = np.random.default_rng(0)
     for i, run in enumerate(runs):  # scatter of 20 %, and a gyro whose sign is turned
-        seen = late(0.27, "wheels")(with_lidar(run, 0.16))
+        (seen,) = with_late_streams([with_lidar(run, 0.16)], ["wheels"], 0.27)
         runs[i] = of_gyro(times(-(1 + 0.2 * rng.standard_normal())))(seen)
     found = latencies(runs)
     truth_s = {GYRO: -0.27, SPEED_X: -0.11, HEADING: -0.11}

@@ -9,8 +9,8 @@ import pytest
 
 from pipelines.explain.statements import reference_text
 from pipelines.report.results import as_json
-from terrain.discrepancy.compared import ComparedRun, compare_runs
-from terrain.discrepancy.diagnosed_runs import acting_causes, extended_effects
+from terrain.discrepancy.compared import ComparedRun
+from terrain.discrepancy.diagnosed_runs import extended_effects
 from terrain.discrepancy.health import Change, Column, Fault, FaultKind
 from terrain.discrepancy.held_out import (
     DRIVEN,
@@ -20,7 +20,7 @@ from terrain.discrepancy.held_out import (
     split_runs,
 )
 from terrain.discrepancy.runs import Simulation, low_pass_of, signals_of
-from terrain.discrepancy.verdict import INTERVAL_T, Cause, Value, Verdict
+from terrain.discrepancy.verdict import INTERVAL_T
 from terrain.effects import CHANNELS, GYRO
 from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog
@@ -119,29 +119,9 @@ def test_a_fault_is_repaired_in_the_held_out_runs_that_have_it():
 # -- What is named is built in -------------------------------------------------------------------------------
 
 
-def diagnosis(robot="husky", cov=None, **values):
-    causes = [
-        Cause(
-            name, (), (Value(name, x, "", x - 0.01, x + 0.01),), 0.2, (0.1, 0.3), ("speed_x_mps",), 9.0, 5.0
-        )
-        for name, x in values.items()
-    ]
-    about = {"robot": robot, "causes": causes, "values": values, "verdict": Verdict.NONE}
-    return SimpleNamespace(covariance=(tuple(values), cov), **about)
-
-
-def test_causes_are_added_to_what_is_built_in_already_of_the_same_robot():
-    built_in = {"payload_ratio": 0.1, "scrub_ratio": 0.02}
-    simulation = Simulation(HUSKY, effects=built_in, scatter={"gyro_bias_radps": 0.1})
-    extended = simulation.with_effects({"payload_ratio": 0.05, "gyro_scale_ratio": 0.02})
-    assert extended.effects == pytest.approx(
-        {"payload_ratio": 0.15, "scrub_ratio": 0.02, "gyro_scale_ratio": 0.02}
-    )
-    assert (extended.robot, extended.scatter) == (simulation.robot, simulation.scatter)
-
-
 def test_the_covariance_of_what_is_found_again_replaces_the_known_one():
-    again = diagnosis(cov=np.array([[4.0, 1.0], [1.0, 9.0]]) * 1e-6, lever_x_m=0.1, lever_y_m=-0.05)
+    found = {"lever_x_m": 0.1, "lever_y_m": -0.05}
+    again = SimpleNamespace(values=found, covariance=([*found], np.array([[4.0, 1.0], [1.0, 9.0]]) * 1e-6))
     known = {"lever_x_m": 0.2, "payload_ratio": 0.1}
     robot = replace(HUSKY, effects=known, effects_cov=np.array([[1.0, 0.5], [0.5, 16.0]]) * 1e-4)
     values, cov, intervals = extended_effects(robot, again)
@@ -150,19 +130,6 @@ def test_the_covariance_of_what_is_found_again_replaces_the_known_one():
     assert intervals["payload_ratio"] == pytest.approx((0.1 - INTERVAL_T * 0.04, 0.1 + INTERVAL_T * 0.04))
     with pytest.raises(ConfigError, match="no covariance"):
         extended_effects(replace(HUSKY, effects=known), again)
-
-
-def test_a_cause_acts_on_the_channels_that_it_changes():
-    both, simulation, runs = (
-        diagnosis(effective_track_ratio=1.5, camera_yaw_rad=0.1),
-        Simulation(HUSKY),
-        signals(1, {}),
-    )
-    used = compare_runs(simulation, simulation.with_effects(both.values), runs, low_pass_of(runs))
-    acting = acting_causes(simulation, both, runs, used)
-    assert "yaw_rate_radps" in acting["effective_track_ratio"]
-    assert "speed_y_mps" in acting["camera_yaw_rad"]
-    assert "yaw_rate_radps" not in acting["camera_yaw_rad"]
 
 
 # -- A black-box reference finds what depends on the inputs, no more than is there, beside the names -----------

@@ -53,30 +53,25 @@ NOISE = np.array([0.01, 0.005, 0.005, 0.1, 1.0, 1.0, 0.02])
 # -- From streams to signals on one clock ------------------------------------------------------------------
 
 
-def labelled_drive(robot, **options):
-    t = np.arange(1001) / 50
-    twist = np.column_stack([0.4 * np.sin(0.8 * t), np.zeros_like(t), 0.3 * np.sin(1.1 * t)])
-    if robot is AGRIMARO:
-        twist[:, 1] = 0.2 * np.sin(0.5 * t)
-    return simulate(
-        robot,
-        twist,
-        Ground(),
-        1,
-        terrain="grass",
-        conditions=Conditions(grade_ratio=(0.05, 0.0), undulation_ratio=0.02),
-        **options,
-    )
+def drive(robot, effects=None, heading=False):
+    """Return a run without noise; one with steered wheels never stops, where they would turn in no time."""
+    t = np.arange(1501) / 50
+    start = np.minimum(t, 1.0)
+    speed = 0.5 * np.sin(0.8 * t) + 0.2 * np.sin(1.9 * t) + 0.7 * start * (robot is AGRIMARO)
+    twist = np.column_stack([speed, np.zeros_like(t), 0.3 * np.sin(1.1 * t)]) * start[:, None]
+    hills = Conditions(grade_ratio=(0.05, 0.02), undulation_ratio=0.02)
+    about = {"terrain": "grass", "heading": heading, "conditions": hills}
+    return simulate(robot, twist, Ground(), 1, effects=effects, **about)
 
 
 @pytest.fixture(scope="module")
 def husky():
-    return labelled_drive(HUSKY, heading=True)
+    return drive(HUSKY, heading=True)
 
 
 @pytest.fixture(scope="module")
 def agrimaro():
-    return labelled_drive(AGRIMARO)
+    return drive(AGRIMARO)
 
 
 def channel(signals, name):
@@ -95,7 +90,7 @@ def kept(stream, rows):
 def test_streams_of_a_skid_steer_robot_are_resampled_to_one_clock(husky):
     signals = signals_of(husky, HUSKY)
     wheels, imu, seen = (husky.streams[name] for name in ("wheels", "imu", "odometry"))
-    assert (signals.run_id, signals.terrain, signals.dt_s, len(signals)) == ("run", "grass", 0.02, 1001)
+    assert (signals.run_id, signals.terrain, signals.dt_s, len(signals)) == ("run", "grass", 0.02, 1501)
     assert_allclose(signals.time_s, wheels.time_s)
     assert_array_equal(signals.wheel_speed_mps, wheels.values[:, :2])
     assert not signals.steer_rad.any()
@@ -220,30 +215,12 @@ def test_a_run_that_cannot_be_compared_is_refused_in_one_sentence(husky, agrimar
 # -- From signals to rows behind one low-pass --------------------------------------------------------------
 
 
-def drive(robot, effects):
-    t = np.arange(1501) / 50
-    start = np.minimum(t, 1.0)
-    speed = 0.5 * np.sin(0.8 * t) + 0.2 * np.sin(1.9 * t)
-    twist = np.column_stack([speed, np.zeros_like(t), 0.3 * np.sin(1.1 * t)]) * start[:, None]
-    if robot is AGRIMARO:
-        twist[:, 0] += 0.7 * start  # where it stops, its steering turns in no time
-    return simulate(
-        robot,
-        twist,
-        Ground(),
-        1,
-        effects=effects,
-        heading=robot is HUSKY,
-        conditions=Conditions(grade_ratio=(0.05, 0.02), undulation_ratio=0.02),
-    )
-
-
 @pytest.fixture(scope="module", params=ROBOTS)
 def looked_at(request):
     """Robot, its simulation, and the signals of a noise-free drive with effects hidden."""
     robot = ROBOTS[request.param]
     effects = HIDDEN[request.param]
-    return Simulation(robot), effects, signals_of(drive(robot, effects), robot)
+    return Simulation(robot), effects, signals_of(drive(robot, effects, robot is HUSKY), robot)
 
 
 def test_the_right_effects_leave_a_small_residual_and_none_a_large_one(looked_at):

@@ -86,21 +86,6 @@ def test_a_bound_near_zero_has_an_edge_of_its_own(value, at_bound):
     assert bool(diagnose._at_bound(problem, fit, effect)) == at_bound
 
 
-def test_a_value_that_grows_along_a_run(hide, pose, solve):
-    def growing(imu):
-        values, at = imu.values.copy(), imu.channels.index("gyro_z_radps")
-        values[:, at] *= 1 + 0.16 * imu.time_s / 30.0
-        return values
-
-    runs = [with_stream(run, "imu", growing) for run in hide({}, scatter=ALIKE)]
-    problem = pose(runs, ("gyro_scale", "camera_yaw"), STEADY)
-    fit = solve(problem)
-    assert [cause.name for cause in fit.causes] == ["gyro_scale"]
-    assert "depends on time: 0.0" in reason(problem, fit)
-    # what is left still has its shape, which is a second reason
-    assert probe_residuals(fit.info, fit.names, fit.change)["yaw_rate_radps", "time turn"].significant
-
-
 def test_an_input_that_gains_much_beside_it_and_looks_like_it(yaw):
     problem, fit = yaw
     gain = raw_gain(fit, fit.causes[0])
