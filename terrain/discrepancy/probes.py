@@ -120,20 +120,18 @@ def probe_residuals(
         results |= {(channel, name): result for name, result in zip(inputs[0], tested, strict=True)}
         for wheel in range(info.rows[0].inputs.shape[1] - len(INPUTS) + 1):
             # the mean square of waves that no wheel makes: what they explain is no turn of a wheel
-            false = np.concatenate([_wave_statistics(info, c, wheel, times) for times in PLACEBOS])
+            explained = _wave_statistics(info, c, wheel)
+            false = np.concatenate([explained[times] for times in PLACEBOS])
             placebo = max(float(np.mean(false)) / 2.0, 1.0) if false.size else 1.0
             for harmonic in HARMONICS:
-                waves = _wave_statistics(info, c, wheel, harmonic) / placebo
-                result = ProbeResult(0.0, 0.0)
+                waves, result = np.array(explained[harmonic]) / placebo, ProbeResult(0.0, 0.0)
                 if (
                     waves.size
                 ):  # a phase of its own in each run; the median of chi^2 with 2 degrees is 2 log 2
                     in_most_runs = float(np.median(waves)) > 2 * math.log(2.0) * 1.5
                     z = z_of(float(chi2.logsf(waves.sum(), 2 * waves.size))) if in_most_runs else 0.0
                     result = ProbeResult(z, float(waves.sum()) - 2 * waves.size)
-                results[channel, f"wheel {wheel + 1} turn" + ("" if harmonic == 1 else f" x{harmonic}")] = (
-                    result
-                )
+                results[channel, f"wheel {wheel + 1} turn{'' if harmonic == 1 else f' x{harmonic}'}"] = result
     return results
 
 
@@ -223,14 +221,16 @@ def _test_inputs(
     return results
 
 
-def _wave_statistics(info: Evidence, c: int, wheel: int, times: float) -> Array:
-    """Return what a multiple of a wheel's angle explains of each run (runs,), as chi^2 with 2 degrees."""
-    explained = []
+def _wave_statistics(info: Evidence, c: int, wheel: int) -> dict[float, list[float]]:
+    """Return what each multiple of a wheel's angle explains of the runs, as chi^2 with 2 degrees."""
+    explained: dict[float, list[float]] = {times: [] for times in (*PLACEBOS, *HARMONICS)}
     for i, run in enumerate(info.rows):
-        phase = times * run.inputs[:, len(INPUTS) - 1 + wheel]
-        waves = _whitened(info, i, c, run.inputs[:, 0] * np.array([np.cos(phase), np.sin(phase)]))
-        (products,) = _products(info, i, c, [], waves, (0, len(phase)))
-        own, score = products[:2, :2], products[:2, 2]
-        if np.linalg.eigvalsh(own)[0] > 1e-6:
-            explained.append(float(score @ np.linalg.solve(own, score)))
-    return np.array(explained)
+        phase = np.outer([*explained], run.inputs[:, len(INPUTS) - 1 + wheel])
+        waves = _whitened(info, i, c, run.inputs[:, 0] * np.concatenate([np.cos(phase), np.sin(phase)]))
+        (products,) = _products(info, i, c, [], waves, (0, phase.shape[1]))
+        for k, of_runs in enumerate(explained.values()):
+            both = [k, k + len(explained)]
+            own, score = products[np.ix_(both, both)], products[both, -1]
+            if np.linalg.eigvalsh(own)[0] > 1e-6:
+                of_runs.append(float(score @ np.linalg.solve(own, score)))
+    return explained
