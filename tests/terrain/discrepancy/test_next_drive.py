@@ -61,17 +61,6 @@ def test_the_suggested_drive_has_the_stated_collinearity_index(simulation, group
     assert collinearity(evidence_of(simulation, driven, names), names) < max(1.5 * comes, 0.5 * was)
 
 
-def test_twins_need_a_sensor_and_the_reason_names_it():
-    steady, names = replace(HUSKY, scatter={}), ["gyro_scale_ratio", "effective_track_ratio"]
-    runs = [
-        replace(run, streams={name: s for name, s in run.streams.items() if name != "odometry"})
-        for run in drives(HUSKY, "complex")
-    ]
-    info = evidence_of(steady, runs, names)
-    reason = next_drive(steady, [("effective_track", "gyro_scale")], (), info).reason
-    assert "one without heading_rate_radps" in reason
-
-
 def test_an_effect_that_was_not_excited_gets_a_drive_with_its_limit():
     names = ["side_hill_slip_ratio", "camera_yaw_rad"]
     missed = [Limit("side_hill_slip_ratio", np.inf, "ratio", "both signs of roll")]
