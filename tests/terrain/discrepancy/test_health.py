@@ -16,6 +16,8 @@ from studies.blind_trials.trial import hidden_runs, simulation_of, with_late_str
 from pipelines.data.datasets import load_runs
 from terrain.discrepancy.clocks import latencies_of, shifts_of
 from terrain.discrepancy.health import (
+    AMPS,
+    KEYS,
     A,
     Agreement,
     Change,
@@ -26,8 +28,10 @@ from terrain.discrepancy.health import (
     agreement_of,
     clocks_of,
     faults_of,
+    likeliest,
     odd_runs,
     on_own_clocks,
+    options_of,
     reading_of,
     repaired,
     stalled_runs,
@@ -124,8 +128,7 @@ WRITTEN = {
     "currents in mA": (edit(times(1e3), **CURRENTS), UNIT, Column.CURRENTS, 1e-3),
     "wheels 2 and 3": (edit(exchanged, wheels=("motor_2", "motor_3")), SWAPPED, Column.WHEELS, 1),
 }
-#: In rpm its wheels predict accelerations that are none, and currents that no motor has: these judge no unit.
-OF_SWERVE = ("wheels 2 and 3", "wheels in rpm", "gyro in deg/s", "accelerometer in g")
+OF_SWERVE = ("wheels 2 and 3", "gyro in deg/s", "accelerometer in g")
 CASES = [(name, "husky", i % 2 == 1) for i, name in enumerate(WRITTEN) if name != OF_SWERVE[0]]
 
 
@@ -188,6 +191,15 @@ def test_of_many_runs_one_is_no_other_unit_and_of_sessions_all_have_the_fault():
     runs += [replace(run, run_id=f"sand_{i}") for i, run in enumerate(sound()[4:])]
     (fault,) = faults(on_one_clock(runs))
     assert "in all 4 runs of gravel" in fault.sentence
+
+
+def test_the_unit_of_wheels_is_not_judged_by_the_currents():
+    """In rpm these wheels predict accelerations that are none, and currents that no motor has."""
+    gains = {G: -2.25, X: -2.15, A: -2.56, AMPS: -2.28}
+    logs = np.array([gains.get(c, np.nan) for c in KEYS])
+    (change,), rivals = likeliest(logs, options_of(logs[None], AGRIMARO), AGRIMARO)
+    assert (change.column, change.factor) == (Column.WHEELS, pytest.approx(1 / RPM))
+    assert rivals == []
 
 
 def test_a_heading_says_whether_the_gyro_or_the_wheels_are_turned():
