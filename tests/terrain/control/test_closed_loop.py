@@ -68,7 +68,7 @@ def test_wheels_of_unequal_radius_do_not_work_against_each_other_in_a_circle_on_
 
 
 def test_a_wrong_target_costs_no_speed_on_dry_sand():
-    options = {"scenario": "straight", "terrain": "dry_sand", "seed": 200, "duration_s": 24.0}
+    options = {"scenario": "straight", "terrain": "dry_sand", "seed": 200, "duration_s": 15.0}
     plain, low, high = (
         final_speed(history(name, **options)) for name in ("plain", "target:0.02", "target:0.6")
     )
@@ -76,10 +76,10 @@ def test_a_wrong_target_costs_no_speed_on_dry_sand():
 
 
 def test_tracking_holds_on_a_side_slope_with_backlash_and_without_a_camera():
-    ends, options = {}, SituationOptions(duration_s=23.0, leg_backlash_rad=0.02)
+    ends, options = {}, SituationOptions(duration_s=16.0, leg_backlash_rad=0.02)
     where = make_situation("straight", ROBOT, "grass", 200, options)
     slope = replace(where.conditions, grade_ratio=(0.0, math.tan(math.radians(5.0))))
-    where = where._replace(conditions=slope, faults=Faults(camera_lost_s=((10.0, 13.0),)))
+    where = where._replace(conditions=slope, faults=Faults(camera_lost_s=((8.0, 11.0),)))
     for name in ("plain", "fallback+track"):
         truth = simulate_situation(ROBOT, where, Loop(name).step, DELAY_S).streams["truth"]
         moved = [abs(np.ptp(truth.channel(each)[[0, -1]])) for each in ("position_y_m", "yaw_rad")]

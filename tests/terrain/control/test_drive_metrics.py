@@ -102,8 +102,8 @@ def test_scrub_is_the_energy_dissipated_along_the_wheels_and_across():
     assert found.ground_mps[0] == pytest.approx(at_wheel)
     assert found.scrub_j[-1] == pytest.approx(0.0, abs=1e-9)
     control = Stream(time_of(), np.ones((1000, 1)), ("desired_mps",))
-    assert immobilised(found, control) == 0
-    assert immobilised(history(speed_x_mps=-0.5), control) == 1  # slides back
+    slides_back = history(speed_x_mps=-0.5)
+    assert (immobilised(found, control), immobilised(slides_back, control)) == (0, 1)
 
 
 def test_peak_slip_is_the_mean_over_wheels_above_a_speed_and_ignores_single_samples():
@@ -130,12 +130,11 @@ def test_a_robot_is_stuck_where_it_does_not_move_although_desired():
 
 def test_final_speed_stopping_distance_and_command_change():
     time_s = time_of(30.0)
-    assert final_speed(
-        history(duration_s=30.0, speed_x_mps=np.where(time_s < 20, 0.5, 0.8))
-    ) == pytest.approx(0.8)
+    faster = history(duration_s=30.0, speed_x_mps=np.where(time_s < 20, 0.5, 0.8))
+    assert final_speed(faster) == pytest.approx(0.8)
     found = history(duration_s=30.0, speed_x_mps=-np.clip(1.0 - (time_s - 10.0), 0.0, 1.0))
-    assert stopping_distance(found, 10.0) == pytest.approx(0.5, abs=0.01)
-    assert stopping_distance(found, 9.0) == pytest.approx(1.5, abs=0.01)
+    stops_m = [stopping_distance(found, start_s) for start_s in (10.0, 9.0)]
+    assert stops_m == pytest.approx([0.5, 1.5], abs=0.01)
     assert math.isnan(stopping_distance(history(speed_x_mps=0.5), 1.0))
     ramps = np.column_stack([2.0 * time_s, -2.0 * time_s, 2.0 * time_s])
     names = tuple(f"wheel_{i}_radps" for i in (1, 2, 3))

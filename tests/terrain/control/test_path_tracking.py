@@ -25,10 +25,8 @@ TWIST = pytest.mark.parametrize("twist", [np.array(twist) for twist in TWISTS.va
 
 def moved(pose, twist, dt_s=DT_S):
     middle = pose[2] + 0.5 * dt_s * twist[2]
-    cos, sin = math.cos(middle), math.sin(middle)
-    return pose + dt_s * np.array(
-        [cos * twist[0] - sin * twist[1], sin * twist[0] + cos * twist[1], twist[2]]
-    )
+    velocity = complex(*twist[:2]) * complex(math.cos(middle), math.sin(middle))
+    return pose + dt_s * np.array([velocity.real, velocity.imag, twist[2]])
 
 
 def step(state, twist, pose, ground=None, std=0.001, stale_s=0.0, dt_s=DT_S, settings=SETTINGS):
@@ -90,16 +88,14 @@ def tracked(poses, ground, desired):
 
 
 def test_corrections_do_not_depend_on_the_origin_and_are_mirror_symmetric():
-    desired = np.array([0.7, 0.1, 0.12])
+    desired, turn = np.array([0.7, 0.1, 0.12]), 2.5
     poses, ground = wandering(np.random.default_rng(1), 200)
     rows = tracked(poses, ground, desired)
     assert set(rows[:, 6]) <= {TrackStatus.OK, TrackStatus.CLAMPED}
     assert np.abs(rows[:, :3] - desired).max() > 0.01
-    turn, shift = 2.5, np.array([100.0, -40.0])
     cos, sin = math.cos(turn), math.sin(turn)
-    turned = np.column_stack(
-        [poses[:, :2] @ [[cos, sin], [-sin, cos]] + shift, poses[:, 2] + turn + 4 * math.pi]
-    )
+    place = poses[:, :2] @ [[cos, sin], [-sin, cos]] + [100.0, -40.0]
+    turned = np.column_stack([place, poses[:, 2] + turn + 4 * math.pi])
     np.testing.assert_allclose(tracked(turned, ground, desired), rows, atol=1e-9)
     across = poses + np.array([0.0, 0.0, math.pi - 0.2 - poses[0, 2]])  # a heading that passes half a turn
     wrapped = across - np.array([0.0, 0.0, 2.0 * math.pi]) * (across[:, 2:] > math.pi)

@@ -28,24 +28,12 @@ TARGET = TractionTarget(0.1)
 """Terrain on which braking is controlled."""
 
 
-def steps(
-    state,
-    wheel,
-    *,
-    ground_mps=0.0,
-    accel=0.0,
-    slip=0.0,
-    std=0.0,
-    stale_s=0.0,
-    torque=0.0,
-    dt_s=DT_S,
-    aim=TARGET,
-    using=SETTINGS,
-):
+def steps(state, wheel, *, ground_mps=0.0, accel=0.0, slip=0.0, std=0.0, torque=0.0, using=SETTINGS):
     """One step, each row given whole or as one number for all wheels; (command, next state, report)."""
     rows = [np.array(np.broadcast_to(row, 3), float) for row in (wheel, ground_mps, accel, slip, std, torque)]
-    target, wheels = TractionTarget(*map(float, aim)), WheelMotion(*rows[1:], rows[0], NAN, stale_s)
-    return traction_step(using, state, target, RADIUS_M, rows[0], wheels, dt_s)
+    return traction_step(
+        using, state, TARGET, RADIUS_M, rows[0], WheelMotion(*rows[1:], rows[0], NAN, 0.0), DT_S
+    )
 
 
 def plain(using, m, aim, radius, wheel, ground, accel, slips, stds, stale, torque, dt):
@@ -60,17 +48,12 @@ def plain(using, m, aim, radius, wheel, ground, accel, slips, stds, stale, torqu
     share = [abs(s) for s in m["share"]]
     known = [all(map(math.isfinite, row)) for row in zip(ground, accel, slips, stds, strict=True)]
     near = [i for i in range(3) if known[i] and share[i] >= 0.3]
-    q, a = 0.0, 0.0
-    if near:
-        i = min(near, key=lambda i: direction[i] * ground[i] / share[i])
-        q, a = direction[i] * ground[i] / share[i], direction[i] * accel[i] / share[i]
-    largest = 0.0
-    for i in range(3):
-        if known[i]:
-            wheel_speed = abs(ground[i]) / max(1 - max(direction[i] * slips[i], 0), 0.05)
-            largest = max(
-                largest, stds[i] * wheel_speed / max(wheel_speed, 1.5 * using.launch_mps, m["from"])
-            )
+    along = [(direction[i] * ground[i] / share[i], direction[i] * accel[i] / share[i]) for i in near]
+    q, a = min(along, key=lambda one: one[0], default=(0.0, 0.0))
+    largest, slowest = 0.0, max(1.5 * using.launch_mps, m["from"])
+    for i in filter(known.__getitem__, range(3)):
+        wheel_speed = abs(ground[i]) / max(1 - max(direction[i] * slips[i], 0), 0.05)
+        largest = max(largest, stds[i] * wheel_speed / max(wheel_speed, slowest))
     certain = not largest > using.std_max_ratio
     fresh = stale <= using.stale_max_s
     checks = {TractionStatus.NO_SLIP: all(known), TractionStatus.STALE: fresh}
@@ -157,7 +140,7 @@ def numbers_of(state):
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=40)
+@settings(max_examples=30)
 def test_any_drive_with_faults_equals_the_reference_implementation(seed):
     rng = np.random.default_rng(seed)
     changes = {"launch_mps": float(rng.choice([0.01, 0.22])), "droop_time_s": 0.2, "fade_mps2": 1.07}
@@ -166,7 +149,7 @@ def test_any_drive_with_faults_equals_the_reference_implementation(seed):
     memory, state = remembered(), TractionState()
     desired, v, bits = rng.choice([-1, 1], 3) * rng.uniform(0.2, 5, 3), 0.0, rng.uniform(0, 0.1)
     push = rng.uniform(0, 1)
-    for k in range(120):
+    for k in range(100):
         if rng.random() < 0.03:  # a new command: stop, another speed, another turn
             desired = rng.choice([0.0, 0.3, 1.0, -1.0]) * rng.choice([-1, 1], 3) * rng.uniform(0.2, 5, 3)
         level = min(1, k / 40)
@@ -206,12 +189,8 @@ def test_speed_never_falls_while_more_is_desired_and_the_turning_centre_stays(
         np.array(POSITIONS_M), RADIUS_M, 1e9, 1e9, 1.0, np.array(twist, float), np.zeros(3)
     )[1:]
     state = TractionState(driven_mps=was, desired_mps=was)
-    inputs = {
-        "ground_mps": direction * np.sign(wheel),
-        "accel": accel,
-        "slip": slip,
-        "torque": torque * wheel,
-    }
+    inputs = {"ground_mps": direction * np.sign(wheel), "accel": accel, "slip": slip}
+    inputs["torque"] = torque * wheel
     for std in (0.0, 1.0):
         even = SETTINGS._replace(droop_radps_per_nm=0.0)
         command, after, report = steps(state, wheel, **inputs, std=std, using=even)

@@ -125,28 +125,28 @@ def random_motion(n=700):
 
 @pytest.mark.parametrize("cuts", [range(1, 700), range(1, 700, 20), [1, 2, 3, 250, 251, 699]])
 def test_a_motion_in_blocks_gives_the_bytes_of_the_motion_in_one(cuts):
+    often = {"dropout_rate_hz": 3.0, "dropout_length_s": 0.02, "jump_rate_hz": 4.0}
     odd = with_changes("sensors", imu_rate_hz=128.0, imu_latency_s=0.0, wheels_rate_hz=30.0).with_parts(
-        camera=dataclasses.replace(ROBOT.camera, dropout_rate_hz=3.0, dropout_length_s=0.02, jump_rate_hz=4.0)
+        camera=dataclasses.replace(ROBOT.camera, **often)
     )
-    faults = Faults(camera_lost_s=((0.1, 0.2),))
+    faults, receiver = Faults(camera_lost_s=((0.1, 0.2),)), Gnss(rate_hz=70.0, latency_s=0.02)
     whole, parts = Motion(random_motion()), Motion(random_motion(), 0)
     for robot in (ROBOT, odd):
-        pairs = [
+        at_once, in_blocks = (
             [
-                wheel_sensor(motion, robot, rng()),
-                steering_sensor(motion, robot, rng()),
+                *(make(motion, robot, rng()) for make in (wheel_sensor, steering_sensor)),
                 imu_sensor(motion, robot, rng())[0],
                 camera_sensor(motion, robot, rng(), faults),
-                gnss_sensor(motion, Gnss(rate_hz=70.0, latency_s=0.02), rng()),
+                gnss_sensor(motion, receiver, rng()),
             ]
             for motion in (whole, parts)
-        ]
+        )
         parts.n_rows = 0
         for n_rows in (*cuts, 700):
             parts.grow(n_rows)
-            for sensor in pairs[1]:
+            for sensor in in_blocks:
                 sensor.update()
-        for one, other in zip(*pairs, strict=True):
+        for one, other in zip(at_once, in_blocks, strict=True):
             batch, blocks = stream_of(one), other.stream()
             assert len(batch) > 20
             assert np.isfinite(batch.values).all()
@@ -155,39 +155,46 @@ def test_a_motion_in_blocks_gives_the_bytes_of_the_motion_in_one(cuts):
 
 
 def test_noise_at_rest_is_that_of_the_description():
-    motion = motion_of(60.0)
-    sensors, camera = ROBOT.sensors, ROBOT.camera
-    still = with_changes(
-        "sensors", gyro_bias_std_radps=0.0, gyro_walk_radps=0.0, accel_bias_std_mps2=0.0, tilt_std_rad=0.0
+    motion, sensors, camera = motion_of(60.0), ROBOT.sensors, ROBOT.camera
+    unbiased = dict.fromkeys(
+        ("gyro_bias_std_radps", "gyro_walk_radps", "accel_bias_std_mps2", "tilt_std_rad"), 0.0
     )
-    imu, bias = imu_stream(motion, still, rng())
+    imu, bias = imu_stream(motion, with_changes("sensors", **unbiased), rng())
     assert not bias.any()
-    assert_std(columns_of(imu, "gyro_{}_radps", "xyz"), sensors.gyro_std_radps, 0.0)
-    assert_std(columns_of(imu, "accel_{}_mps2", "xyz"), sensors.accel_std_mps2, [0.0, 0.0, G])
-    assert_std(columns_of(imu, "{}_rad", ["roll", "pitch"]), TILT_NOISE_RAD, 0.0)
-    assert_std(imu.channel("yaw_rad"), sensors.yaw_std_rad, 0.0)
-
     seen = camera_stream(motion, ROBOT, rng(), QUIET)
     assert (seen.channel("confidence_ratio") == 1.0).all()
-    assert_std(columns_of(seen, "velocity_{}_mps", "xyz"), camera.speed_std_mps, 0.0)
-    assert_std(columns_of(seen, "rate_{}_radps", "xyz"), camera.yaw_rate_std_radps, 0.0)
-    assert_std(np.diff(body_motion(seen, ROBOT.camera).yaw_rad)[::2], math.sqrt(2) * camera.yaw_std_rad, 0.0)
-    # the plane of the camera's fixed frame: x right, z back; from sample to sample it hardly drifts
-    wheel = with_changes("camera", yaw_std_rad=0.0)
-    place = columns_of(camera_stream(motion, wheel, rng(), QUIET), "position_{}_m", "xz")
-    assert_std(np.diff(place, axis=0)[::2], math.sqrt(2) * camera.position_std_m, 0.0)
-
     fixed = gnss_stream(motion_of(200.0), Gnss(fix_length_s=1e9), rng())
-    assert_std(columns_of(fixed, "position_{}_m", "xy"), 0.02, 0.0)
-    assert_std(columns_of(fixed, "velocity_{}_mps", "xy"), 0.03, 0.0)
     wheels = wheels_stream(motion, ROBOT, rng())
-    assert_std(columns_of(wheels, "current_{}_a", "123"), sensors.current_std_a, 0.0)
     assert not columns_of(wheels, "motor_{}_radps", "123").any()  # no Hall step, no rate
     rolling = wheels_stream(motion_of(60.0, reported_radps=2.0), ROBOT, rng())
-    assert_std(columns_of(rolling, "motor_{}_radps", "123"), sensors.motor_std_radps, 20.0)
     step_rad = 2 * math.pi / sensors.steering_steps_ratio
-    angle = columns_of(steering_stream(motion, ROBOT, rng()), "angle_{}_rad", "123")
-    assert_std(angle, math.hypot(sensors.steering_std_rad, step_rad / math.sqrt(12)), 0.0)
+    steering = steering_stream(motion, ROBOT, rng())
+    for stream, pattern, names, std, centre in (
+        (imu, "gyro_{}_radps", "xyz", sensors.gyro_std_radps, 0.0),
+        (imu, "accel_{}_mps2", "xyz", sensors.accel_std_mps2, [0.0, 0.0, G]),
+        (imu, "{}_rad", ["roll", "pitch"], TILT_NOISE_RAD, 0.0),
+        (imu, "{}_rad", ["yaw"], sensors.yaw_std_rad, 0.0),
+        (seen, "velocity_{}_mps", "xyz", camera.speed_std_mps, 0.0),
+        (seen, "rate_{}_radps", "xyz", camera.yaw_rate_std_radps, 0.0),
+        (fixed, "position_{}_m", "xy", 0.02, 0.0),
+        (fixed, "velocity_{}_mps", "xy", 0.03, 0.0),
+        (wheels, "current_{}_a", "123", sensors.current_std_a, 0.0),
+        (rolling, "motor_{}_radps", "123", sensors.motor_std_radps, 20.0),
+        (
+            steering,
+            "angle_{}_rad",
+            "123",
+            math.hypot(sensors.steering_std_rad, step_rad / math.sqrt(12)),
+            0.0,
+        ),
+    ):
+        assert_std(columns_of(stream, pattern, names), std, centre)
+    # of the camera's heading, and in the plane of its fixed frame (x right, z back): from sample to sample both
+    # hardly drift
+    assert_std(np.diff(body_motion(seen, camera).yaw_rad)[::2], math.sqrt(2) * camera.yaw_std_rad, 0.0)
+    steady = camera_stream(motion, with_changes("camera", yaw_std_rad=0.0), rng(), QUIET)
+    steps = np.diff(columns_of(steady, "position_{}_m", "xz"), axis=0)
+    assert_std(steps[::2], math.sqrt(2) * camera.position_std_m, 0.0)
 
 
 def test_a_bias_walks_and_the_yaw_drifts_with_it():
@@ -196,39 +203,27 @@ def test_a_bias_walks_and_the_yaw_drifts_with_it():
     assert_std(np.diff(bias), sensors.gyro_walk_radps / math.sqrt(100), 0.0)
     drift = np.concatenate([[0.0], np.cumsum(bias[1:])]) / 100
     assert abs(drift[-1]) > 0.05
-    assert_std(
-        imu.channel("yaw_rad") - drift, sensors.yaw_std_rad, 0.0
-    )  # it begins at 0, whatever the heading
+    # it begins at 0, whatever the heading
+    assert_std(imu.channel("yaw_rad") - drift, sensors.yaw_std_rad, 0.0)
     truth = dynamic_truth(motion_of(100.0), bias, imu.time_s)
     np.testing.assert_allclose(truth.channel("gyro_bias_z_radps"), bias, rtol=0, atol=1e-15)
 
 
 def test_latency_and_lag_come_back_from_the_phase_of_a_sine():
-    frequency_hz, time_s = 3.0, clock(30.0)
+    frequency_hz, time_s, sensors, camera = 3.0, clock(30.0), ROBOT.sensors, ROBOT.camera
     sine, turn = np.sin(2 * math.pi * frequency_hz * time_s), 2 * math.pi * frequency_hz
-    motion = motion_of(
-        30.0,
-        yaw_rate_radps=sine,
-        accel_x_mps2=sine,
-        ride_z_mps2=sine,
-        speed_x_mps=sine,
-        position_y_m=sine,
-        steer_rad=sine[:, None],
-    )
+    moving = ("yaw_rate_radps", "accel_x_mps2", "ride_z_mps2", "speed_x_mps", "position_y_m")
+    motion = motion_of(30.0, **dict.fromkeys(moving, sine), steer_rad=sine[:, None])
 
     def lag_s(time_constant_s, latency_s=0.0):
         return latency_s + math.atan(turn * time_constant_s) / turn
 
-    imu, _ = imu_stream(motion, ROBOT, rng())
-    latency_s = ROBOT.sensors.imu_latency_s
     gyro_s, accel_s = (
-        lag_s(1 / (2 * math.pi * IMU_BANDWIDTH_HZ[name]), latency_s) for name in ("gyro", "accel")
+        lag_s(1 / (2 * math.pi * IMU_BANDWIDTH_HZ[name]), sensors.imu_latency_s) for name in ("gyro", "accel")
     )
-    camera = ROBOT.camera
-    seen = camera_stream(motion, with_changes("camera", lever_x_m=0.0, lever_y_m=0.0), rng(), QUIET)
     speed_s = lag_s(camera.time_constant_s, camera.latency_s)
-    gnss = gnss_stream(motion, Gnss(rate_hz=20.0), rng())
-    steering = steering_stream(motion, ROBOT, rng())
+    imu, _ = imu_stream(motion, ROBOT, rng())
+    seen = camera_stream(motion, with_changes("camera", lever_x_m=0.0, lever_y_m=0.0), rng(), QUIET)
     for stream, channel, sign, expected_s, within_s in (
         (imu, "gyro_z_radps", 1, gyro_s, 6e-4),  # the low-pass works in steps of 1 ms: half a step early
         (imu, "accel_x_mps2", 1, accel_s, 6e-4),
@@ -236,8 +231,8 @@ def test_latency_and_lag_come_back_from_the_phase_of_a_sine():
         (seen, "velocity_z_mps", -1, speed_s, 6e-4),
         (seen, "rate_y_radps", 1, speed_s, 6e-4),
         (seen, "position_x_m", -1, camera.latency_s, 1e-4),
-        (gnss, "position_y_m", 1, 0.1, 5e-4),
-        (steering, "angle_2_rad", 1, 0.0, 1e-4),
+        (gnss_stream(motion, Gnss(rate_hz=20.0), rng()), "position_y_m", 1, 0.1, 5e-4),
+        (steering_stream(motion, ROBOT, rng()), "angle_2_rad", 1, 0.0, 1e-4),
     ):
         late = stream.time_s > 1.0
         found_s = delay_s(stream.time_s[late], sign * stream.channel(channel)[late], frequency_hz)
@@ -264,13 +259,8 @@ def test_steering_is_seen_in_whole_steps_with_its_zero_and_wrapped():
 def test_the_gyro_follows_the_tilt_on_an_even_slope_and_on_undulation():
     time_s = clock(10.0)
     yaw = 0.5 * time_s
-    turning = motion_of(
-        10.0,
-        yaw_rad=yaw,
-        yaw_rate_radps=0.5,
-        grade_x_ratio=0.1 * np.cos(yaw),
-        grade_y_ratio=-0.1 * np.sin(yaw),
-    )
+    uphill = {"grade_x_ratio": 0.1 * np.cos(yaw), "grade_y_ratio": -0.1 * np.sin(yaw)}
+    turning = motion_of(10.0, yaw_rad=yaw, yaw_rate_radps=0.5, **uphill)
     gyro = columns_of(imu_stream(turning, SILENT_IMU, rng())[0], "gyro_{}_radps", "xyz")[10:]
     np.testing.assert_allclose(gyro, [[0.0, 0.0, 0.5]] * len(gyro), atol=1e-6)  # 0.05 were it Euler's angles
     undulation = motion_of(10.0, grade_x_ratio=0.05 * np.sin(time_s), grade_y_ratio=0.03 * np.sin(2 * time_s))
@@ -284,35 +274,29 @@ def test_the_gyro_follows_the_tilt_on_an_even_slope_and_on_undulation():
 
 def circle(duration_s, radius_m=2.0, speed_mps=0.8, lateral_mps=0.1):
     """A circle driven at a constant drift angle, from the origin with heading 0."""
-    time_s, turn = clock(duration_s), speed_mps / radius_m
-    yaw = turn * time_s
+    turn = speed_mps / radius_m
+    yaw = turn * clock(duration_s)
     step = (speed_mps + 1j * lateral_mps) / (1j * turn) * (np.exp(1j * yaw) - 1)
-    return motion_of(
-        duration_s,
-        yaw_rad=yaw,
-        yaw_rate_radps=turn,
-        speed_x_mps=speed_mps,
-        speed_y_mps=lateral_mps,
-        position_x_m=step.real,
-        position_y_m=step.imag,
-    )
+    place = {"yaw_rad": yaw, "position_x_m": step.real, "position_y_m": step.imag}
+    twist = {"yaw_rate_radps": turn, "speed_x_mps": speed_mps, "speed_y_mps": lateral_mps}
+    return motion_of(duration_s, **place, **twist)
 
 
 def test_the_camera_without_noise_gives_the_ideal_odometry_stream():
     camera = dataclasses.replace(SILENT_CAMERA.camera, time_constant_s=0.0, lever_z_m=0.3)
     motion = Motion(random_motion())
     found = camera_stream(motion, SILENT_CAMERA.with_parts(camera=camera), rng(), QUIET)
-    _, rows = motion.at(camera.rate_hz, camera.latency_s)
-    seen = odometry_stream(
-        found.time_s,
-        np.column_stack([motion.record[name][rows] for name in ("position_x_m", "position_y_m")]),
-        np.column_stack([motion.record[name][rows] for name in ("roll_rad", "pitch_rad", "yaw_rad")]),
-        np.column_stack(
-            [motion.record[name][rows] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")]
-        ),
-        camera,
-        yaw_0=motion.record["yaw_rad"][0],
+    at = motion.record[motion.at(camera.rate_hz, camera.latency_s)[1]]
+    place, attitude, twist = (
+        np.column_stack([at[name] for name in names.split()])
+        for names in (
+            "position_x_m position_y_m",
+            "roll_rad pitch_rad yaw_rad",
+            "speed_x_mps speed_y_mps yaw_rate_radps",
+        )
     )
+    yaw_0 = motion.record["yaw_rad"][0]
+    seen = odometry_stream(found.time_s, place, attitude, twist, camera, yaw_0=yaw_0)
     assert found.channels == seen.channels
     np.testing.assert_allclose(found.values, seen.values, rtol=0, atol=1e-12)
 
@@ -348,25 +332,23 @@ def test_dropouts_and_jumps_come_by_chance_at_their_rates():
 
 
 def test_gnss_reports_delayed_positions_with_their_accuracy():
-    motion = circle(60.0)
-    receiver = Gnss(fix_length_s=3.0, float_length_s=1.0)
+    motion, receiver = circle(60.0), Gnss(fix_length_s=3.0, float_length_s=1.0)
     seen = [gnss_stream(motion, receiver, rng(seed)) for seed in range(10)]
     fixed = np.concatenate([stream.channel("fix_ratio") for stream in seen]).astype(bool)
     assert fixed.mean() == pytest.approx(0.75, abs=0.12)  # 150 stretches of either kind
-    changes = np.diff(fixed.astype(int))
-    assert poisson.cdf((changes == -1).sum(), fixed.sum() / 10 / 3.0) == pytest.approx(0.5, abs=0.4999)
+    lost = (np.diff(fixed.astype(int)) == -1).sum()
+    assert poisson.cdf(lost, fixed.sum() / 10 / 3.0) == pytest.approx(0.5, abs=0.4999)
     std = np.concatenate([stream.channel("std_position_m") for stream in seen])
     np.testing.assert_array_equal(std, np.where(fixed, 0.02, 0.5))
-    then = np.maximum(np.round((seen[0].time_s - 0.1) / STEP_S).astype(int), 0)
-    position = np.column_stack([motion.record["position_x_m"], motion.record["position_y_m"]])[then]
-    yaw = motion.record["yaw_rad"][then]
-    velocity = np.column_stack([0.8 * np.cos(yaw) - 0.1 * np.sin(yaw), 0.8 * np.sin(yaw) + 0.1 * np.cos(yaw)])
+    then = motion.record[np.maximum(np.round((seen[0].time_s - 0.1) / STEP_S).astype(int), 0)]
+    cos, sin = np.cos(then["yaw_rad"]), np.sin(then["yaw_rad"])
+    position = np.column_stack([then["position_x_m"], then["position_y_m"]])
+    velocity = np.column_stack([0.8 * cos - 0.1 * sin, 0.8 * sin + 0.1 * cos])
     errors = np.vstack([columns_of(stream, "position_{}_m", "xy") - position for stream in seen])
     assert_std(errors[fixed], 0.02, 0.0)
     assert_std(errors[~fixed], 0.5, 0.0)
-    assert_std(
-        np.vstack([columns_of(stream, "velocity_{}_mps", "xy") - velocity for stream in seen]), 0.03, 0.0
-    )
+    of_speeds = [columns_of(stream, "velocity_{}_mps", "xy") - velocity for stream in seen]
+    assert_std(np.vstack(of_speeds), 0.03, 0.0)
 
 
 def test_the_truth_is_what_happened_and_a_slip_that_never_was_is_no_channel():

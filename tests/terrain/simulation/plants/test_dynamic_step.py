@@ -85,9 +85,8 @@ def wheels(motion):
 
 def ramp(duration_s, radps=5.0, rise_s=1.0):
     """Return equal wheel commands (n, 3) that rise to a rate in that time."""
-    return np.repeat(
-        radps * np.minimum(np.arange(round(duration_s * 50)) / 50 / rise_s, 1.0)[:, None], 3, axis=1
-    )
+    rising = np.minimum(np.arange(round(duration_s * 50)) / 50 / rise_s, 1.0)
+    return np.repeat(radps * rising[:, None], 3, axis=1)
 
 
 def steady_slip(plant, radps=5.0, duration_s=10.0):
@@ -210,19 +209,11 @@ def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer
 
 def test_a_drive_with_everything_in_it_is_that_of_the_plain_form():
     rng = np.random.default_rng(3)
+    load = {"payload_kg": 25.0, "payload_m": (0.1, -0.08), "radius_factors": (1.01, 0.99, 1.0)}
+    land = {"grade_ratio": (0.04, -0.06), "undulation_ratio": 0.03, "undulation_length_m": 2.0}
     plant = plant_of(
-        load_soil("tiles"),
-        load_soil("clay"),
-        load_soil("grass"),
-        roughness_m3=5e-4,
-        starts_m=(0.0, 0.2, 0.6),
-        backlash_rad=0.02,
-        payload_kg=25.0,
-        payload_m=(0.1, -0.08),
-        radius_factors=(1.01, 0.99, 1.0),
-        grade_ratio=(0.04, -0.06),
-        undulation_ratio=0.03,
-        undulation_length_m=2.0,
+        *map(load_soil, ("tiles", "clay", "grass")),
+        **(load | land | {"roughness_m3": 5e-4, "starts_m": (0.0, 0.2, 0.6), "backlash_rad": 0.02}),
         leg_backlash_rad=0.03,
         field=rng.uniform(0.8, 1.2, (2, 3, 9)),
     )
@@ -233,38 +224,32 @@ def test_a_drive_with_everything_in_it_is_that_of_the_plain_form():
     rows, state = np.empty(len(noise), BODY_ROW), start_state(np.full(3, 0.015))
     held = (np.repeat(commands, SUBSTEPS, axis=0) for commands in (wheel, steer))
     advance(*plant, state, *held, noise, rows)
-    motion = Motion(rows)
     assert plain["path"][-1] > 0.7  # on all three grounds
-    assert np.ptp(motion.record["leg_rad"]) > 0.03  # and through its play
-    for name, twin in (("yaw_rad", "yaw"), ("yaw_rate_radps", "turn"), ("path_m", "path")):
-        np.testing.assert_allclose(motion.record[name], plain[twin], rtol=0, atol=1e-9, err_msg=name)
-    np.testing.assert_allclose(
-        motion.record["speed_x_mps"], plain["speed_x"] + plain["turn"] * plant.com_m[1], rtol=0, atol=1e-9
+    assert np.ptp(rows["leg_rad"]) > 0.03  # and through its play
+    turn, along, across = (rows[name] for name in ("yaw_rate_radps", "speed_x_mps", "speed_y_mps"))
+    of_wheels = (
+        ("wheel_radps", "rate"),
+        ("steer_rad", "steer"),
+        ("normal_n", "normal"),
+        ("torque_nm", "torque"),
     )
-    np.testing.assert_allclose(
-        motion.record["speed_y_mps"], plain["speed_y"] - plain["turn"] * plant.com_m[0], rtol=0, atol=1e-9
-    )
-    for name, twin, atol in (
-        ("wheel_radps", "rate", 1e-9),
-        ("steer_rad", "steer", 1e-12),
-        ("normal_n", "normal", 1e-6),
-        ("torque_nm", "torque", 1e-7),
-        ("patch_ratio", "patch", 0),
+    for name, found, expected in (
+        *((name, rows[name], plain[twin]) for name, twin in (("yaw_rad", "yaw"), ("path_m", "path"))),
+        *((name, rows["wheels"][name], plain[twin]) for name, twin in of_wheels),
+        ("patches", rows["wheels"]["patch_ratio"], plain["patch"]),
+        ("rates as reported", rows["wheels"]["reported_radps"][:-1], plain["reported"][1:]),
+        ("yaw rate", turn, plain["turn"]),
+        ("speed of the origin", along, plain["speed_x"] + plain["turn"] * plant.com_m[1]),
+        ("speed to its left", across, plain["speed_y"] - plain["turn"] * plant.com_m[0]),
+        # acceleration at the origin is what its speed does
+        ("acceleration", rows["accel_x_mps2"][:-1], np.diff(along) / STEP_S - (turn * across)[:-1]),
+        ("acceleration left", rows["accel_y_mps2"][:-1], np.diff(across) / STEP_S + (turn * along)[:-1]),
+        # of the plane through the corners
+        ("roll", rows["ride_roll_rad"], (plain["ride"][:, :2].mean(axis=1) - plain["ride"][:, 2]) / 0.756),
+        ("pitch", rows["ride_pitch_rad"], (plain["ride"][:, 0] - plain["ride"][:, 1]) / 1.015),
     ):
-        np.testing.assert_allclose(wheels(motion)[name], plain[twin], rtol=0, atol=atol, err_msg=name)
-    np.testing.assert_allclose(
-        wheels(motion)["reported_radps"][:-1], plain["reported"][1:], rtol=0, atol=1e-7
-    )
-    # acceleration at the origin is what its speed does
-    turn, along, across = (motion.record[name] for name in ("yaw_rate_radps", "speed_x_mps", "speed_y_mps"))
-    recorded = [motion.record[name][:-1] for name in ("accel_x_mps2", "accel_y_mps2")]
-    np.testing.assert_allclose(recorded[0], np.diff(along) / STEP_S - (turn * across)[:-1], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(recorded[1], np.diff(across) / STEP_S + (turn * along)[:-1], rtol=0, atol=1e-9)
-    # roll and pitch of the plane through the corners
-    roll = (plain["ride"][:, :2].mean(axis=1) - plain["ride"][:, 2]) / 0.756
-    np.testing.assert_allclose(motion.record["ride_roll_rad"], roll, rtol=0, atol=1e-9)
-    pitch = (plain["ride"][:, 0] - plain["ride"][:, 1]) / 1.015
-    np.testing.assert_allclose(motion.record["ride_pitch_rad"], pitch, rtol=0, atol=1e-9)
+        atol = {"normal_n": 1e-6, "torque_nm": 1e-7, "rates as reported": 1e-7}.get(name, 1e-9)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=atol, err_msg=name)
 
 
 @pytest.mark.parametrize("name", ["asphalt", "grass", "clay", "dry_sand"])
@@ -278,15 +263,12 @@ def test_steady_slip_is_that_at_which_a_wheel_pulls_its_share_of_the_hill(name, 
 
 
 def test_at_rest_on_the_level_nothing_at_all_happens():
-    motion = drive(
-        plant_of(load_soil("grass"), roughness_m3=1e-3, backlash_rad=0.02), np.zeros((100, 3)), seed=0
-    )
-    assert len({row.tobytes() for row in motion.record}) == 1
-    assert np.isnan(wheels(motion)["slip_ratio"]).all()
-    assert np.isnan(wheels(motion)["slip_angle_rad"]).all()
-    plant = plant_of(load_soil("grass"))
+    plant = plant_of(load_soil("grass"), roughness_m3=1e-3, backlash_rad=0.02)
+    rows = drive(plant, np.zeros((100, 3)), seed=0).record
+    assert len({row.tobytes() for row in rows}) == 1
+    assert np.isnan([rows["wheels"]["slip_ratio"], rows["wheels"]["slip_angle_rad"]]).all()
     state = start_state(np.zeros(3))
-    settle(*plant, state)
+    settle(*plant_of(load_soil("grass")), state)
     state["n_steps"] = 0
     assert state.tobytes() == start_state(np.zeros(3)).tobytes()
 
@@ -295,52 +277,40 @@ def test_at_rest_on_the_level_nothing_at_all_happens():
 @pytest.mark.parametrize("uphill_rad", [0.0, 1.5, 2.4, 4.0])
 def test_a_robot_at_rest_on_a_slope_of_5_degrees_does_not_move(name, uphill_rad):
     tan = math.tan(math.radians(5.0))
-    plant = plant_of(
-        load_soil(name),
-        grade_ratio=(tan * math.cos(uphill_rad), tan * math.sin(uphill_rad)),
-        backlash_rad=0.02,
-    )
-    motion = drive(plant, np.zeros((500, 3)), settled=True)
-    moved_m = np.hypot(motion.record["position_x_m"], motion.record["position_y_m"])
+    grade_ratio = tan * math.cos(uphill_rad), tan * math.sin(uphill_rad)
+    plant = plant_of(load_soil(name), grade_ratio=grade_ratio, backlash_rad=0.02)
+    rows = drive(plant, np.zeros((500, 3)), settled=True).record
+    moved_m = np.hypot(rows["position_x_m"], rows["position_y_m"])
     assert moved_m.max() < 5e-3  # sand, whose resistance is a viscous one at a crawl, takes its time
     assert moved_m[-1] - moved_m[-1001] < 1e-4
-    assert np.abs(motion.record["yaw_rad"]).max() < 1e-3
-    assert np.abs(motion.record["accel_x_mps2"]).max() < 0.02
-    assert np.abs(motion.record["accel_y_mps2"]).max() < 0.02
-    np.testing.assert_allclose(
-        wheels(motion)["normal_n"].sum(axis=1), 90 * GRAVITY_MPS2 * math.cos(math.radians(5.0))
-    )
+    assert np.abs(rows["yaw_rad"]).max() < 1e-3
+    assert max(np.abs(rows[name]).max() for name in ("accel_x_mps2", "accel_y_mps2")) < 0.02
+    weight_n = 90 * GRAVITY_MPS2 * math.cos(math.radians(5.0))
+    np.testing.assert_allclose(rows["wheels"]["normal_n"].sum(axis=1), weight_n)
 
 
 @pytest.mark.parametrize("leg_backlash_rad", [0.0, 0.03])
 def test_motor_work_in_curves_is_dissipated_by_lateral_slip_too(leg_backlash_rad):
     soil = load_soil("grass")
     plant = plant_of(soil, leg_backlash_rad=leg_backlash_rad)
-    at = np.arange(400)[:, None]
-    steer = np.clip(0.8 * np.sin(at / 60), -0.5, 0.5) * [-1.0, 1.0, 0.4]
-    motion = drive(plant, ramp(8.0, 7.0), steer, settled=True)
-    turn, heading, rate = (
-        motion.record["yaw_rate_radps"],
-        wheels(motion)["steer_rad"],
-        wheels(motion)["wheel_radps"],
-    )
+    steer = np.clip(0.8 * np.sin(np.arange(400)[:, None] / 60), -0.5, 0.5) * [-1.0, 1.0, 0.4]
+    rows = drive(plant, ramp(8.0, 7.0), steer, settled=True).record
+    turn, names = rows["yaw_rate_radps"], ("steer_rad", "wheel_radps", "traction_n", "side_n", "normal_n")
+    heading, rate, thrust, side, normal = (rows["wheels"][name] for name in names)
     x, y = ROBOT.wheel_positions_m.T
-    centre_x = motion.record["speed_x_mps"][:, None] - turn[:, None] * y
-    centre_y = motion.record["speed_y_mps"][:, None] + turn[:, None] * x
+    centre_x = rows["speed_x_mps"][:, None] - turn[:, None] * y
+    centre_y = rows["speed_y_mps"][:, None] + turn[:, None] * x
     along = np.cos(heading) * centre_x + np.sin(heading) * centre_y
     across = -np.sin(heading) * centre_x + np.cos(heading) * centre_y
-    thrust, side = wheels(motion)["traction_n"], wheels(motion)["side_n"]
-    resistance = (
-        soil.rolling_resistance_ratio * wheels(motion)["normal_n"] * np.tanh(along / ROLLING_SPEED_MPS)
+    resistance = soil.rolling_resistance_ratio * normal * np.tanh(along / ROLLING_SPEED_MPS)
+    given, friction, rolling, slipping, sliding = (
+        power_w.sum() * STEP_S
+        for power_w in (
+            *(rows["wheels"]["torque_nm"] * rate, plant.friction_nm * np.tanh(rate / 0.1) * rate),
+            *(resistance * along, thrust * (0.2 * rate - along), side * -across),
+        )
     )
-    given = (wheels(motion)["torque_nm"] * rate).sum() * STEP_S
-    friction = (plant.friction_nm * np.tanh(rate / 0.1) * rate).sum() * STEP_S
-    rolling = (resistance * along).sum() * STEP_S
-    slipping = (thrust * (0.2 * rate - along)).sum() * STEP_S
-    sliding = (side * -across).sum() * STEP_S
-    v = np.array(
-        [motion.record["speed_x_mps"][-1] - turn[-1] * plant.com_m[1], motion.record["speed_y_mps"][-1]]
-    )
+    v = np.array([rows["speed_x_mps"][-1] - turn[-1] * plant.com_m[1], rows["speed_y_mps"][-1]])
     stored = 0.5 * (90 * v @ v + 20.0 * turn[-1] ** 2 + plant.wheel_inertia_kgm2 * rate[-1] @ rate[-1])
     assert sliding > 0.02 * given
     assert given == pytest.approx(stored + friction + rolling + slipping + sliding, rel=5e-3)
@@ -362,27 +332,24 @@ def test_the_speed_loop_reaches_its_speed_and_does_not_wind_up():
 @pytest.mark.parametrize("speed_mps", [0.5, 1.6])
 def test_vibration_is_that_of_the_spectrum_of_the_road(speed_mps):
     """Two routes: the simulated corner, and ISO 8608 through the transfer functions of contact and tyre."""
-    roughness_m3 = 64e-6
+    roughness_m3, body = 64e-6, ROBOT.body
     plant = plant_of(STICKY, roughness_m3=roughness_m3)
-    motion = drive(plant, ramp(40.0, speed_mps / 0.2), seed=1)
-    seen = motion.record["ride_z_mps2"][2000:].std()
-    mass, stiffness, damping = 30.0, ROBOT.body.tyre_stiffness_npm, ROBOT.body.tyre_damping_nspm
+    rides = drive(plant, ramp(40.0, speed_mps / 0.2), seed=1).record["ride_z_mps2"]
+    mass, stiffness, damping = 30.0, body.tyre_stiffness_npm, body.tyre_damping_nspm
 
     def density(f):
-        road = (
-            ROUGHNESS_WAVENUMBER**2 * roughness_m3 * speed_mps / (f**2 + (ROUGHNESS_CUTOFF * speed_mps) ** 2)
-        )
+        cut_off = (ROUGHNESS_CUTOFF * speed_mps) ** 2
+        road = ROUGHNESS_WAVENUMBER**2 * roughness_m3 * speed_mps / (f**2 + cut_off)
         s = 2j * math.pi * f
-        contact = 1 / (1 + s * 0.5 * ROBOT.body.contact_length_m / speed_mps)
+        contact = 1 / (1 + s * 0.5 * body.contact_length_m / speed_mps)
         tyre = s**2 * (damping * s + stiffness) / (mass * s**2 + damping * s + stiffness)
         return road * abs(contact * tyre) ** 2
 
     corner = math.sqrt(quad(density, 0.0, 500.0, points=[5.0, 7.0, 9.0, 50.0], limit=500)[0])
-    assert seen == pytest.approx(
-        corner / math.sqrt(2), rel=0.08
-    )  # the mean of two corners; 40 s tell it to 2 %
+    # the mean of two corners; 40 s tell it to 2 %
+    assert rides[2000:].std() == pytest.approx(corner / math.sqrt(2), rel=0.08)
     rougher = drive(plant.changed(roughness_m3=4 * roughness_m3), ramp(2.0, speed_mps / 0.2), seed=1)
-    smooth = motion.record["ride_z_mps2"][:2000]
+    smooth = rides[:2000]
     np.testing.assert_allclose(rougher.record["ride_z_mps2"], 2 * smooth, rtol=0.02, atol=0.02 * smooth.std())
 
 
@@ -414,11 +381,6 @@ def driven(plant, duration_s=6.0, seed=None):
     return drive(plant, wheel, seed=seed, settled=True, substeps=1)
 
 
-def change_of_rate_radps(motion):
-    """The largest change of a wheel's rate from step to step in the last half second."""
-    return np.abs(np.diff(wheels(motion)["wheel_radps"][-500:], axis=0)).max()
-
-
 def test_the_roots_of_the_step_are_on_the_unit_circle_at_the_limit():
     for factor, stable in ((0.999, True), (1.001, False)):
         k, damping_s = factor * CONTACT_LIMIT_PS2, DEFLECTION_DAMPING_S
@@ -437,7 +399,8 @@ def test_what_is_accepted_gains_no_momentum_that_the_motors_did_not_give(soil):
     momentum_ns = plant.mass_kg * motion.record["speed_x_mps"]
     # what resists only takes from it
     assert (momentum_ns <= push_ns - spin_ns + 0.01 * plant.mass_kg).all()
-    assert change_of_rate_radps(motion) < 0.4
+    changes_radps = np.abs(np.diff(wheels(motion)["wheel_radps"][-500:], axis=0))  # from step to step
+    assert changes_radps.max() < 0.4
 
 
 def test_a_light_robot_on_stiff_tyres_is_refused():

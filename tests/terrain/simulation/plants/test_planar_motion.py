@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -77,13 +78,12 @@ def rich(robot, dt=DT, length_s=30.0):
     return np.column_stack([speed, 0.9 * speed, 1.1 * speed]), steer, grade, roll
 
 
-def replayed(robot, values, wheel_speed, steer=None, grade=None, roll=None, ground=FREE, dt=DT):
+def replayed(robot, values, wheel_speed, steer=None, grade=0.0, roll=0.0, ground=FREE, dt=DT):
     """Return channels (n,) by name."""
     n = len(wheel_speed)
     steer = np.zeros((n, wheel_speed.shape[1])) if steer is None else steer
-    grade = np.full(n, grade or 0.0) if np.ndim(grade) == 0 else grade
-    roll = np.full(n, roll or 0.0) if np.ndim(roll) == 0 else roll
-    shown = replay(make_planar(robot, ground), vector_of(values), dt, wheel_speed, steer, grade, roll)
+    tilt = (np.array(np.broadcast_to(angle, n), dtype=float) for angle in (grade, roll))
+    shown = replay(make_planar(robot, ground), vector_of(values), dt, wheel_speed, steer, *tilt)
     return dict(zip(CHANNELS, shown.T, strict=True))
 
 
@@ -100,17 +100,13 @@ def test_the_wheels_of_a_twist_move_the_robot_by_that_twist(twist):
 
 
 @pytest.mark.parametrize("drive", ROBOTS)
-@pytest.mark.parametrize(
-    "values", [{}, {"force_slip_ratio": 0.5, "turning_slip_ratio": 0.3, "payload_ratio": 0.5}]
-)
-def test_the_answer_hardly_depends_on_the_step(drive, values):
-    robot = ROBOTS[drive]
-    coarse, fine = (
-        replay(make_planar(robot, Ground()), vector_of(values), dt, *rich(robot, dt)) for dt in (0.02, 0.005)
-    )
-    for c, channel in enumerate(CHANNELS):
-        off = np.std((fine[::4, c] - coarse[:, c])[5:-5])
-        assert off <= 0.02 * np.std(fine[:, c]) + 1e-12, channel
+def test_the_answer_hardly_depends_on_the_step(drive):
+    planar = make_planar(ROBOTS[drive], Ground())
+    for values in ({}, {"force_slip_ratio": 0.5, "turning_slip_ratio": 0.3, "payload_ratio": 0.5}):
+        runs = (replay(planar, vector_of(values), dt, *rich(planar.robot, dt)) for dt in (0.02, 0.005))
+        coarse, fine = runs
+        off = (fine[::4] - coarse)[5:-5].std(axis=0)
+        assert (off <= 0.02 * fine.std(axis=0) + 1e-12).all(), dict(zip(CHANNELS, off, strict=True))
 
 
 def test_slip_follows_its_equation_of_force():
@@ -181,21 +177,22 @@ def test_three_wheels_that_slip_each_by_itself_move_as_one_twist_that_slips():
     assert (np.abs(coarse - one[::40])[25:].mean(axis=0) < 0.01 * lost).all()
 
 
-def test_a_bent_thrust_curve_slips_by_its_inverse_and_a_load_presses_as_much_as_it_weighs():
+@pytest.mark.parametrize("grade", [0.0, 0.05])
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_a_bent_thrust_curve_slips_by_its_inverse_and_a_load_presses_as_much_as_it_weighs(robot, grade):
     share = 1 - (1 - np.exp(-3 * (s := np.linspace(1e-9, 1.0, 101)))) / (3 * s)
     ground = Ground(rolling_ratio=0.1, thrust_ratio=tuple(0.4 * share), load_ratio=1.0)
-    for robot in ROBOTS.values():
-        n = len(robot.wheels)
-        for grade in (0.0, 0.05):
-            shown = replayed(still(robot), {}, at_rate([0.5] * n), grade=grade, ground=ground)[SPEED_X][-1]
-            desired = 0.1 * shown / math.hypot(shown, ROLLING_MPS) + math.sin(grade)
-            if robot is HUSKY:
-                desired = 0.1 * direction(shown) + math.sin(grade)
-            assert 1 - shown / 0.5 == pytest.approx(np.interp(desired, 0.4 * share, s), rel=2e-3)
-            loaded = replayed(
-                still(robot), {"payload_ratio": 0.5}, at_rate([0.5] * n), grade=grade, ground=ground
-            )
-            assert loaded[SPEED_X][-1] == pytest.approx(shown, rel=1e-6)
+    shown, loaded = (
+        replayed(still(robot), values, at_rate([0.5] * len(robot.wheels)), grade=grade, ground=ground)[
+            SPEED_X
+        ]
+        for values in ({}, {"payload_ratio": 0.5})
+    )
+    speed = shown[-1]
+    resists = direction(speed) if robot is HUSKY else speed / math.hypot(speed, ROLLING_MPS)
+    slip = np.interp(0.1 * resists + math.sin(grade), 0.4 * share, s)
+    assert 1 - speed / 0.5 == pytest.approx(slip, rel=2e-3)
+    assert loaded[-1] == pytest.approx(speed, rel=1e-6)
 
 
 def test_shear_slip_is_the_inverse_of_its_curve_and_starts_with_slope_one():
@@ -214,48 +211,37 @@ def speeds(wheel_speed_mps, values, **options):
 
 
 def test_kinematic_effects_match_their_formulas():
-    b = HUSKY.track_m
-    assert speeds([0.5, 0.5], {"wheel_radius_ratio": 0.1})[SPEED_X][-1] == pytest.approx(0.55)
-    one_sided = speeds([0.5, 0.5], {"one_sided_radius_ratio": 0.1})
-    assert one_sided[GYRO][-1] == pytest.approx(0.1 * 0.5 / b)
-    assert one_sided[SPEED_X][-1] == pytest.approx(0.5)
-    dv = 0.2
-    assert speeds([0.4, 0.6], {"effective_track_ratio": 0.6})[GYRO][-1] == pytest.approx(dv / (1.6 * b))
+    b, dv, ahead = HUSKY.track_m, 0.2, [0.5, 0.5]
     lost = 0.3 * dv / (dv + 1.0) * dv  # k q dv
-    slipping = speeds([0.4, 0.6], {"turning_slip_ratio": 0.3})
-    assert slipping[GYRO][-1] == pytest.approx((dv - lost) / b)
     right, left = 0.6 ** (1 - ENDO_POWER), 0.4 ** (1 - ENDO_POWER)
-    shared = 0.5 * (lost * right - lost * left) / (right + left)
-    assert slipping[SPEED_X][-1] == pytest.approx(0.5 - shared)
-    spot = speeds([-0.1, 0.1], {"turning_slip_ratio": 0.3})
-    assert spot[GYRO][-1] == pytest.approx(0.7 * dv / b)
-    assert spot[SPEED_X][-1] == pytest.approx(0.0, abs=1e-12)
-    for roll in (0.1, -0.1):
-        for speed in (0.5, -0.5):
-            aside = speeds([speed, speed], {"side_hill_slip_ratio": 0.4}, roll=roll)[SPEED_Y][-1]
-            assert aside == pytest.approx(-0.4 * roll * 0.5)  # downhill, in both driving directions
+    shared = 0.5 * lost * (right - left) / (right + left)
+    for wheels, values, speed_mps, turn_radps in (
+        (ahead, {"wheel_radius_ratio": 0.1}, 0.55, 0.0),
+        (ahead, {"one_sided_radius_ratio": 0.1}, 0.5, 0.1 * 0.5 / b),
+        ([0.4, 0.6], {"effective_track_ratio": 0.6}, 0.5, dv / (1.6 * b)),
+        ([0.4, 0.6], {"turning_slip_ratio": 0.3}, 0.5 - shared, (dv - lost) / b),
+        ([-0.1, 0.1], {"turning_slip_ratio": 0.3}, 0.0, 0.7 * dv / b),
+    ):
+        shown = speeds(wheels, values)
+        assert [shown[SPEED_X][-1], shown[GYRO][-1]] == pytest.approx([speed_mps, turn_radps], abs=1e-12)
+    for roll, speed in product((0.1, -0.1), (0.5, -0.5)):
+        aside = speeds([speed, speed], {"side_hill_slip_ratio": 0.4}, roll=roll)[SPEED_Y][-1]
+        assert aside == pytest.approx(-0.4 * roll * 0.5)  # downhill, in both driving directions
 
 
 def test_a_turning_robot_slips_to_the_outside_of_the_turn_and_slows_down():
-    for speed in (0.5, -0.5):
-        for turn in (0.8, -0.8):
-            wheels = skid(HUSKY, speed, turn)
-            aside = speeds(wheels, {"turn_side_slip_s": 0.15})
-            assert aside[SPEED_Y][-1] == pytest.approx(-0.15 * speed * turn)
-            # the centripetal acceleration w v_x points to the inside, the slip to the outside
-            assert np.sign(aside[SPEED_Y][-1]) == -np.sign(turn * speed)
-            np.testing.assert_array_equal(aside[GYRO], speeds(wheels, {})[GYRO])
-            slow = speeds(wheels, {"turn_drag_s2": 0.7})
-            assert slow[SPEED_X][-1] == pytest.approx(speed / (1 + 0.7 * turn**2))
-            assert speeds(wheels, {"turn_drag_s2": -0.1})[SPEED_X][-1] == pytest.approx(
-                speed * (1 + 0.1 * turn**2)
-            )
+    for speed, turn in product((0.5, -0.5), (0.8, -0.8)):
+        wheels = skid(HUSKY, speed, turn)
+        # the centripetal acceleration w v_x points to the inside, the slip to the outside
+        aside = speeds(wheels, {"turn_side_slip_s": 0.15})
+        assert aside[SPEED_Y][-1] == pytest.approx(-0.15 * speed * turn)
+        np.testing.assert_array_equal(aside[GYRO], speeds(wheels, {})[GYRO])
+        for drag, share in ((0.7, 1 / (1 + 0.7 * turn**2)), (-0.1, 1 + 0.1 * turn**2)):
+            assert speeds(wheels, {"turn_drag_s2": drag})[SPEED_X][-1] == pytest.approx(speed * share)
     # the yaw rate is that of the robot: with three times the track it turns a third
     wide = {"effective_track_ratio": 2.0, "turn_drag_s2": 0.9, "turn_side_slip_s": 0.2}
-    shown = speeds(skid(HUSKY, 0.5, 0.9), wide)
-    slow = 0.5 / (1 + 0.9 * 0.3**2)
-    assert shown[SPEED_X][-1] == pytest.approx(slow)
-    assert shown[SPEED_Y][-1] == pytest.approx(-0.2 * slow * 0.3)
+    shown, slow = speeds(skid(HUSKY, 0.5, 0.9), wide), 0.5 / (1 + 0.9 * 0.3**2)
+    assert [shown[SPEED_X][-1], shown[SPEED_Y][-1]] == pytest.approx([slow, -0.2 * slow * 0.3])
     # no drag turns the motion about
     assert (speeds(skid(HUSKY, 0.5, 4.0), {"turn_drag_s2": 3.0})[SPEED_X] > 0).all()
 
@@ -263,65 +249,58 @@ def test_a_turning_robot_slips_to_the_outside_of_the_turn_and_slows_down():
 def test_steering_effects_match_their_formulas():
     robot = still(AGRIMARO)
     wheel, steer = aimed(robot, [0.6, 0.0, 0.2])
-    right, wheel_speed = (
-        replayed(robot, {}, at_rate(wheel * robot.wheel_radius_m), at_rate(steer)),
-        at_rate(wheel * 0.2),
-    )
+    wheel_speed, swing = at_rate(wheel * 0.2), at_rate(steer) + 0.1 * np.sin(2 * TIME_S)[:, None]
+    right, moved = (replayed(robot, {}, wheel_speed, angle) for angle in (at_rate(steer), swing))
     offsets = {f"steering_offset_{i}_rad": 0.03 * i for i in (1, 2, 3)}
     put_off = replayed(robot, offsets, wheel_speed, at_rate(steer - 0.03 * np.arange(1, 4)))
     for channel in (GYRO, SPEED_X, SPEED_Y):
         np.testing.assert_allclose(put_off[channel], right[channel], atol=1e-9)
-    swing = at_rate(steer) + 0.1 * np.sin(2 * TIME_S)[:, None]
-    late = replayed(robot, {"steering_delay_s": 0.1}, wheel_speed, swing)
-    moved = replayed(robot, {}, wheel_speed, np.vstack([np.repeat(swing[:1], 5, axis=0), swing[:-5]]))
-    np.testing.assert_allclose(late[SPEED_Y], moved[SPEED_Y], atol=1e-12)
-    narrow = replayed(robot, {"steering_backlash_rad": 0.2}, wheel_speed, swing)  # wider than the swing
-    np.testing.assert_allclose(narrow[SPEED_Y], right[SPEED_Y], atol=1e-9)
-    with_backlash = replayed(robot, {"steering_backlash_rad": 0.02}, wheel_speed, swing)[SPEED_Y]
-    assert (
-        0.7 < np.ptp(with_backlash[N // 2 :]) / np.ptp(replayed(robot, {}, wheel_speed, swing)[SPEED_Y]) < 0.9
+    late = replayed(robot, {"steering_delay_s": 0.1}, wheel_speed, swing)[SPEED_Y]
+    earlier = np.vstack([np.repeat(swing[:1], 5, axis=0), swing[:-5]])
+    np.testing.assert_allclose(late, replayed(robot, {}, wheel_speed, earlier)[SPEED_Y], atol=1e-12)
+    wide, narrow = (  # the first wider than the swing
+        replayed(robot, {"steering_backlash_rad": play}, wheel_speed, swing)[SPEED_Y] for play in (0.2, 0.02)
     )
+    np.testing.assert_allclose(wide, right[SPEED_Y], atol=1e-9)
+    assert 0.7 < np.ptp(narrow[N // 2 :]) / np.ptp(moved[SPEED_Y]) < 0.9
 
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 def test_forces_and_currents_balance(robot):
     ground = Ground(slip_ratio=0.3, rolling_ratio=0.06, scrub_ratio=0.0)
-    planar = make_planar(robot, ground)
-    weight = robot.mass_kg * GRAVITY_MPS2
-    grade, speed = 0.07, 0.5
+    nm_per_a, n = make_planar(robot, ground).body["nm_per_a"][0], len(robot.wheels)
+    weight, grade, speed = robot.mass_kg * GRAVITY_MPS2, 0.07, 0.5
     slow = ROLLING_MPS if robot is AGRIMARO else RESTING_MPS
-
-    def direction(speed_mps):
-        return speed_mps / math.hypot(speed_mps, slow)
-
-    friction_n = len(robot.wheels) * robot.motors.friction_nm / robot.wheel_radius_m * direction(speed)
+    friction_n = n * robot.motors.friction_nm / robot.wheel_radius_m * speed / math.hypot(speed, slow)
 
     def steady(**values):
         """Return pull, both speeds over the wheel speed, and the accelerometer, of a steady climb."""
-        shown = replayed(
-            still(robot), values, at_rate([speed] * len(robot.wheels)), grade=grade, ground=ground
-        )
-        pull_n = shown[CURRENT][-1] * planar.body["nm_per_a"][0] / robot.wheel_radius_m - friction_n
+        shown = replayed(still(robot), values, at_rate([speed] * n), grade=grade, ground=ground)
+        pull_n = shown[CURRENT][-1] * nm_per_a / robot.wheel_radius_m - friction_n
         return pull_n, shown[SPEED_X][-1] / speed, shown[ACCEL][-1]
 
     pull, share, accel = steady()
-    sign = direction(share * speed)
+    sign = share * speed / math.hypot(share * speed, slow)
     assert pull == pytest.approx(weight * (math.sin(grade) + 0.06 * sign))
     assert share == pytest.approx(1 - 0.3 * pull / weight)
     assert accel == pytest.approx(GRAVITY_MPS2 * math.sin(grade))
-    near = {"rel": 1e-4}  # the direction at the standstill's scale applies to a slower drive
-    assert steady(payload_ratio=0.2)[0] == pytest.approx(1.2 * pull, **near)
     assert steady(motor_constant_ratio=0.1)[0] == pytest.approx(1.1 * pull + 0.1 * friction_n)
     drift = 0.1 * TIME_S[-1] / 60
     assert steady(motor_drift_ratio=0.1)[0] == pytest.approx(pull + drift * (pull + friction_n))
-    assert steady(rolling_resistance_ratio=0.02)[0] == pytest.approx(pull + 0.02 * sign * weight, **near)
-    more, slower, _ = steady(viscous_drag_nspm=50.0)
-    assert more == pytest.approx(pull + 50.0 * slower * speed, **near)
-    more, slower, _ = steady(slip_resistance_ratio=0.5)
-    assert more == pytest.approx(pull + 0.5 * weight * (1 - slower) * sign, **near)
-    assert steady(force_slip_ratio=0.2)[1] == pytest.approx(1 - 0.5 * pull / weight, **near)
+    # the direction at the standstill's scale applies to a slower drive
+    (dragged, by_drag, _), (slipped, by_slip, _) = (
+        steady(**values) for values in ({"viscous_drag_nspm": 50.0}, {"slip_resistance_ratio": 0.5})
+    )
     bent = 0.2 * shear_slip(pull / weight, ground.grip_ratio)
-    assert steady(shear_slip_ratio=0.2)[1] == pytest.approx(1 - 0.3 * pull / weight - bent, **near)
+    for found, expected in (
+        (steady(payload_ratio=0.2)[0], 1.2 * pull),
+        (steady(rolling_resistance_ratio=0.02)[0], pull + 0.02 * sign * weight),
+        (dragged, pull + 50.0 * by_drag * speed),
+        (slipped, pull + 0.5 * weight * (1 - by_slip) * sign),
+        (steady(force_slip_ratio=0.2)[1], 1 - 0.5 * pull / weight),
+        (steady(shear_slip_ratio=0.2)[1], 1 - 0.3 * pull / weight - bent),
+    ):
+        assert found == pytest.approx(expected, rel=1e-4)
 
 
 def test_turning_takes_current_of_the_difference_of_the_sides():

@@ -60,14 +60,7 @@ def heading_to(direction_rad, speed_mps=0.2):
     return speed_mps * np.cos(direction_rad), speed_mps * np.sin(direction_rad), 0.0
 
 
-@pytest.mark.parametrize("twist", [(0.2, 0.1, 0.0), (0.0, -0.3, 0.0), (0.1, 0.0, 0.8)])
-def test_without_friction_of_rollers_or_resistance_the_body_moves_as_its_wheels_roll(twist):
-    steady = twists(moved(centred(ROBOT), CARPET._replace(roller_ratio=0.0), wheels_for(twist)))[-1]
-    spin = abs(twist[2] * twist[0])  # a turn takes a force to the inside, and slip with it
-    np.testing.assert_allclose(steady, twist, atol=1e-9 + spin * CARPET.slip_ratio)
-
-
-@pytest.mark.parametrize("ratio", [0.04, 0.25, 0.8])
+@pytest.mark.parametrize("ratio", [0.0, 0.25, 0.8])
 @pytest.mark.parametrize("direction_rad", [0.0, 0.7, 2.9, 4.4])
 def test_steady_motion_is_that_of_the_balance_of_forces(ratio, direction_rad):
     wheels = wheels_for(heading_to(direction_rad))
@@ -101,10 +94,8 @@ def test_a_start_is_that_of_the_differential_equation():
         v = along @ twist
         speed = np.sqrt(max((u**2).mean(), (v**2).mean()) + ROLLING_MPS**2)
         pull = weight / SOFT / speed * (u - v) - 0.02 * weight * v / np.hypot(v, ROLLING_MPS)
-        force = (
-            pull[:, None] * along
-            - rollers["roller_ratio"] * weight / speed * (across @ twist)[:, None] * across
-        )
+        resists = rollers["roller_ratio"] * weight / speed * (across @ twist)
+        force = pull[:, None] * along - resists[:, None] * across
         turning = np.array([twist[2] * twist[1], -twist[2] * twist[0], 0.0])
         return (load * force).sum(axis=0) / [mass, mass, body["yaw_inertia_kgm2"]] + turning
 
@@ -133,13 +124,12 @@ def test_currents_are_those_of_friction_where_nothing_resists_and_grow_with_the_
 def driven(direction_rad, seed=0, ground=CARPET, speed_mps=0.2, seconds=6.0, effects=None):
     twist = np.zeros((int(50 * seconds) + 1, 3))
     twist[25:] = heading_to(direction_rad, speed_mps)
-    run = simulate(
-        ROBOT, twist, ground, seed, noise=spread_numbers("noise"), terrain="carpet", effects=effects
-    )
+    noise = spread_numbers("noise")
+    run = simulate(ROBOT, twist, ground, seed, noise=noise, terrain="carpet", effects=effects)
     return with_wheel_speeds(run, ROBOT)
 
 
-@pytest.mark.parametrize("direction_rad", [0.3, 2.0, 5.1])
+@pytest.mark.parametrize("direction_rad", [0.3, 2.0])
 def test_measured_slip_of_a_simulated_run_is_its_truth(direction_rad):
     run = driven(direction_rad)
     found, truth = measured_slip(run, ROBOT), run.streams["truth"]
@@ -171,14 +161,11 @@ def test_an_effect_with_a_home_moves_the_robot_as_that_description_does(values):
     assert not described.effects
     wheels = starting() + wheels_for((0.1, -0.05, 0.3), 60)
     radius = described.wheel_radius_m / ROBOT.wheel_radius_m  # a larger wheel rolls further at one rate
-    effect, expected = (
-        moved(ROBOT, CARPET, wheels, vector_of(values)),
-        moved(described, CARPET, radius * wheels),
-    )
+    effect = moved(ROBOT, CARPET, wheels, vector_of(values))
+    expected = moved(described, CARPET, radius * wheels)
     np.testing.assert_allclose(twists(effect), twists(expected), rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(
-        effect["current_a"][10:], expected["current_a"][10:], rtol=0.02
-    )  # rotors: by the rate
+    # rotors: by the rate
+    np.testing.assert_allclose(effect["current_a"][10:], expected["current_a"][10:], rtol=0.02)
 
 
 def test_what_the_ground_adds_to_the_motion_is_in_no_current():
