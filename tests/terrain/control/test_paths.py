@@ -17,20 +17,17 @@ def points_of(path):
     return np.column_stack([path.x_m, path.y_m])
 
 
-@pytest.mark.parametrize("spacing", [4, 20])
-def test_a_path_comes_back_from_its_points(spacing):
-    again = path_from_points(points_of(ARC)[::spacing])
-    n = min(len(again.x_m), len(ARC.x_m)) - 20
-    assert points_of(again)[:n] == pytest.approx(points_of(ARC)[:n], abs=0.01)
-    assert again.curvature_pm[40:n] == pytest.approx(ARC.curvature_pm[40:n], abs=0.01)
-
-
-def test_noise_of_driven_points_does_not_become_curvature():
-    rng, points = np.random.default_rng(2), points_of(ARC)[::10]
-    noisy = path_from_points(points + rng.normal(0.0, 0.02, points.shape), std_m=0.02)
-    n = min(len(noisy.x_m), len(ARC.x_m)) - 40
-    assert noisy.curvature_pm[40:n] == pytest.approx(ARC.curvature_pm[40:n], abs=0.05)
-    assert points_of(noisy)[:n] == pytest.approx(points_of(ARC)[:n], abs=0.06)
+@pytest.mark.parametrize(
+    ("spacing", "std_m", "off_m", "off_pm"), [(4, 0.0, 0.01, 0.01), (10, 0.02, 0.06, 0.05)]
+)
+def test_a_path_comes_back_from_its_points_and_their_noise_does_not_become_curvature(
+    spacing, std_m, off_m, off_pm
+):
+    points = points_of(ARC)[::spacing]
+    again = path_from_points(points + std_m * np.random.default_rng(2).standard_normal(points.shape), std_m)
+    n = min(len(again.x_m), len(ARC.x_m)) - 40
+    assert points_of(again)[:n] == pytest.approx(points_of(ARC)[:n], abs=off_m)
+    assert again.curvature_pm[40:n] == pytest.approx(ARC.curvature_pm[40:n], abs=off_pm)
 
 
 def test_search_is_local_and_does_not_go_back():
@@ -45,14 +42,20 @@ def test_search_is_local_and_does_not_go_back():
 
 def test_statuses_of_places():
     heading, end = ARC.heading_rad[-1], points_of(ARC)[-1]
-    beyond = end + 0.5 * np.array([np.cos(heading), np.sin(heading)])
-    assert ARC.locate(*beyond, heading, 29.0).status == PathStatus.END
-    assert ARC.locate(3.0, 9.0, 0.0, 3.0).status == PathStatus.FAR
-    centre = end + 10.0 * np.array([-np.sin(heading), np.cos(heading)])
-    found = path_from_curvature(np.array([0.0, 9.0]), np.array([0.3, 0.3])).locate(0.0, 3.2, 0.0, 0.0)
-    assert found.status == PathStatus.SINGULAR
-    assert np.isfinite(found[:4]).all()
-    assert np.isfinite(ARC.locate(*centre, 0.0)[:4]).all()
+    beyond, centre = (
+        end + 0.5 * np.array([np.cos(heading), np.sin(heading)]),
+        [-np.sin(heading), np.cos(heading)],
+    )
+    tight = path_from_curvature(np.array([0.0, 9.0]), np.array([0.3, 0.3]))
+    for path, place, status in (
+        (ARC, (*beyond, heading, 29.0), PathStatus.END),
+        (ARC, (3.0, 9.0, 0.0, 3.0), PathStatus.FAR),
+        (tight, (0.0, 3.2, 0.0, 0.0), PathStatus.SINGULAR),
+    ):
+        found = path.locate(*place)
+        assert found.status == status
+        assert np.isfinite(found[:4]).all()
+    assert np.isfinite(ARC.locate(*(end + 10.0 * np.array(centre)), 0.0)[:4]).all()
     lost = ARC.locate(np.nan, 0.0, 0.0, 12.0)
     assert (lost.distance_m, lost.status) == (12.0, PathStatus.NO_POSE)
 
@@ -150,15 +153,14 @@ def test_law_is_17():
 @pytest.mark.parametrize("curvature", [0.0, 0.08])
 def test_deviation_converges_by_its_equation_whatever_the_slip(front, rear, curvature):
     """(2) with known slip under (17): y'' + K_d y' + K_p y = 0 over the distance along the path."""
-    lateral, angle, s, ds, found = 0.5, -rear, 0.0, 0.005, []
-    while s < 20.0:
+    lateral, angle, ds, found = 0.5, -rear, 0.005, []
+    for _ in range(4000):
         steer_rad = law_17(SETTINGS, 1.2, lateral, angle, curvature, front, rear)
-        alpha, gamma = 1 - curvature * lateral, angle + rear
-        per_s = alpha / np.cos(gamma)  # distance driven per distance along the path
+        per_s = (1 - curvature * lateral) / np.cos(
+            angle + rear
+        )  # distance driven per distance along the path
         bend = np.cos(rear) * (np.tan(steer_rad + front) - np.tan(rear)) / 1.2
-        lateral += ds * np.sin(gamma) * per_s
-        angle += ds * (bend * per_s - curvature)
-        s += ds
+        lateral, angle = lateral + ds * np.sin(angle + rear) * per_s, angle + ds * (bend * per_s - curvature)
         found.append(lateral)
     s = np.arange(1, len(found) + 1) * ds
     assert np.array(found) == pytest.approx(0.5 * (1 + 0.4 * s) * np.exp(-0.4 * s), abs=0.01)

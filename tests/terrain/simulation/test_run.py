@@ -68,22 +68,18 @@ def test_the_same_seed_gives_the_same_bytes_and_another_one_other_sensors(plant)
 
 
 @pytest.mark.parametrize("plant", PLANTS)
-def test_every_channel_has_a_unit_and_every_logger_its_rate_from_0_on(plant):
+def test_every_channel_has_a_unit_every_logger_its_rate_from_0_on_and_the_truth_of_a_body_adds_up(plant):
     log = run(plant)
     for name, stream in log.streams.items():
         assert [unit_of(channel) for channel in stream.channels]
         assert stream.time_s[0] == 0.0
         np.testing.assert_allclose(np.diff(stream.time_s), 1.0 / stream.rate_hz, rtol=0, atol=2e-9)
         assert np.isfinite(stream.values[:, [not c.startswith("slip") for c in stream.channels]]).all(), name
-    assert log.streams["truth"].channels[: len(BODY.names)] == BODY.names
-
-
-@pytest.mark.parametrize("plant", PLANTS)
-def test_the_truth_of_a_body_adds_up(plant):
-    truth = run(plant).streams["truth"]
-    yaw = np.unwrap(truth.channel("yaw_rad"))
-    np.testing.assert_allclose(np.gradient(yaw, 0.01)[5:-5], truth.channel("yaw_rate_radps")[5:-5], atol=0.02)
-    side = truth.channel("speed_y_mps") - CAR.com_ahead_m * truth.channel("yaw_rate_radps") * (plant == "car")
+    truth = log.streams["truth"]
+    assert truth.channels[: len(BODY.names)] == BODY.names
+    yaw, turn = np.unwrap(truth.channel("yaw_rad")), truth.channel("yaw_rate_radps")
+    np.testing.assert_allclose(np.gradient(yaw, 0.01)[5:-5], turn[5:-5], atol=0.02)
+    side = truth.channel("speed_y_mps") - CAR.com_ahead_m * turn * (plant == "car")
     velocity = (truth.channel("speed_x_mps") + 1j * side) * np.exp(1j * yaw)
     moved = np.cumsum(0.01 * velocity) - 0.01 * velocity
     place = truth.channel("position_x_m") + 1j * truth.channel("position_y_m")

@@ -115,20 +115,16 @@ def test_specific_force_of_a_robot_at_rest_on_a_slope_is_gravity():
 
 def test_robot_stops_where_its_drive_says_for_as_long_and_a_controller_is_given_what_is_logged():
     seen = []
-
-    def controller(sample):
-        seen.append(sample.measured)
-        return weave(sample)
-
-    log = run(controller)
-    truth, rows = log.streams["truth"], np.array(seen)
+    log = run(lambda sample: seen.append(sample.measured) or weave(sample))
+    streams, rows = log.streams, np.array(seen)
+    truth = streams["truth"]
     stands = (truth.channel("speed_x_mps") == 0.0) & (truth.time_s > 1.0)
     assert truth.channel("distance_m")[stands] == pytest.approx(15.0, abs=0.1)
     assert stands.sum() / 100 == pytest.approx(2.0, abs=0.1)
-    assert (log.streams["wheels"].values[stands[::2], 0] == 0.0).all()
-    assert rows[:, 0] == pytest.approx(log.streams["wheels"].values[:, 0])
-    assert rows[:, 5] == pytest.approx(log.streams["imu"].channel("gyro_z_radps")[::2])
-    assert rows[::5, 2] == pytest.approx(log.streams["gnss"].channel("position_x_m"))
+    assert (streams["wheels"].values[stands[::2], 0] == 0.0).all()
+    assert rows[:, 0] == pytest.approx(streams["wheels"].values[:, 0])
+    assert rows[:, 5] == pytest.approx(streams["imu"].channel("gyro_z_radps")[::2])
+    assert rows[::5, 2] == pytest.approx(streams["gnss"].channel("position_x_m"))
 
 
 def test_commands_that_are_no_numbers_and_speeds_beyond_the_robot_are_refused():

@@ -11,6 +11,7 @@ from scipy.optimize import brentq
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.kernels import filled
+from terrain.kinematics.wheels import TWIST
 from terrain.robots import load_robot
 from terrain.simulation.plants.tracks import (
     QUIET,
@@ -44,17 +45,9 @@ def forces(soil, belts, twist, grade=0.0, roll=0.0, heap=0.0):
 def steady(soil, belts, slope_rad=0.0, uphill_rad=0.0, seconds=1.0, robot=PATAKO):
     """Return the twist once belts have turned for a while from rest."""
     belt_mps = np.tile(np.array(belts, dtype=float), (round(seconds / 0.01), 1))
-    return twist_of(driven(belt_mps, soil, [slope_rad, uphill_rad], 0.01, robot)[-1])
-
-
-def driven(belt_mps, soil, slope, dt_s, robot=PATAKO):
     states = np.zeros(len(belt_mps), STATE)
-    drive_tracks(tracks_on(robot, soil), np.array(slope), belt_mps, states, dt_s)
-    return states
-
-
-def twist_of(state):
-    return np.array([state[name] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")])
+    drive_tracks(tracks_on(robot, soil), np.array([slope_rad, uphill_rad]), belt_mps, states, 0.01)
+    return np.array([states[-1][name] for name in TWIST])
 
 
 @pytest.mark.parametrize("slip", [0.02, 0.2, 0.8])
@@ -93,11 +86,10 @@ def test_friction_takes_energy_from_any_motion():
         assert out @ twist < 0.0
 
 
-@pytest.mark.parametrize("slope_deg", [0.0, 10.0, 20.0])
+@pytest.mark.parametrize("slope_deg", [0.0, 20.0])
 def test_a_climb_slips_as_the_balance_of_forces_asks(slope_deg):
     """Two routes: motion in time, and the slip at which the shear curve gives grade and compaction."""
-    slope = math.radians(slope_deg)
-    weight = PATAKO.mass_kg * GRAVITY_MPS2
+    slope, weight = math.radians(slope_deg), PATAKO.mass_kg * GRAVITY_MPS2
     normal, modulus = 0.5 * weight * math.cos(slope), SAND.kc_npmn1 + 0.15 * SAND.kphi_npmn2
     depth = plate_sinkage(normal / 0.09, 0.15, SAND.kc_npmn1, SAND.kphi_npmn2, 1.1)
     resists = weight * math.sin(slope) + 2 * compaction_resistance(depth, modulus, 1.1) + 0.04 * normal
@@ -115,10 +107,10 @@ def test_a_robot_at_rest_stays_on_a_slope():
 def test_a_step_from_any_motion_reaches_the_balance():
     """At a kink, where an element starts to slide back, at most 2 mm/s are left for the step after."""
     rng, missing, off = np.random.default_rng(0), np.empty(3), []
-    tracks, names = tracks_on(PATAKO, SAND)[0], ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
+    tracks = tracks_on(PATAKO, SAND)[0]
     for k in range(600):
         before = rng.normal(0.0, [0.1, 0.02, 0.2]) if k % 3 else np.zeros(3)
-        state = filled(STATE, **dict(zip(names, before, strict=True)))[0]
+        state = filled(STATE, **dict(zip(TWIST, before, strict=True)))[0]
         belts = rng.choice([-0.2, -0.1, 0.0, 0.1, 0.2, 0.5], 2)
         tilt = tilt_at(math.radians(rng.choice([0, 5, 10, 15])), math.radians(45 * rng.integers(8)), 0.0)
         twist = twist_on_soil(tracks, state, belts, *tilt, 0.01)
