@@ -212,12 +212,6 @@ def test_table_8_1_is_reproduced_and_its_iteration_corrected():
     assert normalised.spread == pytest.approx([0.5, 0.56], abs=0.005)
 
 
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_rows_and_another_others():
-    assert rows("danzi", "slip_bias") == rows("danzi", "slip_bias")
-    assert rows("danzi", "slip_bias") != rows("danzi", "slip_bias", seed=SEED + 1)
-
-
 def test_all_states_are_observable_only_with_a_speed_over_ground():
     for name, as_printed, expected in (
         *(("slip14", True, (9, 12)), ("slip14", False, (10, 12))),

@@ -34,7 +34,7 @@ SLIPS = load_slip_table()
 LOOP = fault_loop(ROBOT, SLIPS)
 FEW = Settings(
     faults="loss_odometry,duplicates_imu",
-    situations="steady",
+    situations="start",
     durations_s="3,inf",
     draw="duplicates_imu",
     first_seed=400,
@@ -90,7 +90,7 @@ def test_a_lost_camera_ends_ok_late_and_duplicates_cost_nothing(few):
     assert all(set(row.bars) == set(BARS) for row in few.rows)
     assert sum(bar.n_met + bar.n_unmet + bar.n_not_judged for bar in few.bars.values()) == 4 * len(BARS)
     (clean,) = few.clean
-    assert clean["start_s"] == 5.0
+    assert clean["start_s"] == 1.0
     assert clean["slip_error_ratio"] < 0.03
 
 
@@ -101,11 +101,11 @@ def test_the_result_does_not_depend_on_the_number_of_processes(few):
 
 
 def test_a_fault_and_an_exception_of_the_pilot_act_from_when_they_begin_and_show_in_their_row(monkeypatch):
-    step, case = LivePilot.step, FaultCase("loss_imu", 1.0, "steady", "grass", 402)
+    step, case = LivePilot.step, FaultCase("loss_imu", 1.0, "start", "grass", 402)
     references = drive_references(LOOP, Place(*case[2:]))
 
     def failing(self, sample):
-        if "imu" not in sample.readings and sample.time_s > 2.0:
+        if "imu" not in sample.readings and sample.time_s > 0.9:
             raise ZeroDivisionError("nothing to divide")
         return step(self, sample)
 
@@ -119,7 +119,7 @@ def test_a_fault_and_an_exception_of_the_pilot_act_from_when_they_begin_and_show
     row = evaluate_case(LOOP, case, references)
     assert (row.figures.n_exceptions, row.bars["finite"]) == (50, False)
     assert row.exception == "ZeroDivisionError: nothing to divide"
-    assert row.figures.recovery_s <= 0.02
+    assert row.figures.recovery_s < 0.05
 
 
 def test_the_report_counts_what_is_met_and_names_what_is_not(few):
@@ -134,8 +134,8 @@ def test_the_report_counts_what_is_met_and_names_what_is_not(few):
     assert ("not met with loss_odometry" in answer) == unmet
     assert [row[1:4] for row in few.report.parts[0].rows] == [bar[1:] for bar in few.bars.values()]
     drawn = drawn_cases(few.rows, ("duplicates",))
-    assert drawn == [FaultCase("duplicates_imu", math.inf, "steady", "grass", 400)]
+    assert drawn == [FaultCase("duplicates_imu", math.inf, "start", "grass", 400)]
     assert all(case.fault == "loss_odometry" for case in drawn_cases(few.rows))
     (figure,) = few.drawn
-    assert figure.title == "duplicates_imu, for good: steady on grass, seed 400"
+    assert figure.title == "duplicates_imu, for good: start on grass, seed 400"
     assert figure.panels[0].marks[0].x[0][0] == few.clean[0]["start_s"]

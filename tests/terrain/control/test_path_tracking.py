@@ -59,7 +59,7 @@ def test_a_constant_disturbance_is_removed_and_nothing_is_added_along_the_path(t
     along = ARM * twist / size
     disturbance = 0.03 * size * np.array([0.7, 0.5, -0.4])
     disturbance -= along * (along @ disturbance)
-    n = round(40.0 / size / DT_S)
+    n = round(32.0 / size / DT_S)
     rows, _, _ = drive(twist, [0.0, 0.0, 0.3], n, disturbance / ARM)
     added = (rows[:, 4:] - twist) * ARM
     assert np.abs(added @ along).max() < 1e-9

@@ -60,6 +60,7 @@ def samples():
     return made
 
 
+@cache
 def arrived(name, seed=0):
     """What arrives of all steps with a fault."""
     given = []

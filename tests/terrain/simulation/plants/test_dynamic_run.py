@@ -261,12 +261,6 @@ def test_a_controller_sees_nothing_of_a_motion_that_blows_up():
         assert all(np.isfinite(reading.values).all() for reading in sample.readings.values())
 
 
-def test_a_status_is_a_stream_whose_names_have_units():
-    def controller(sample):
-        return STAND._replace(status={"gain_ratio": 2.0 * sample.time_s})
-
-    control = run_of("straight", "grass", controller=controller, duration_s=4.0).streams["control"]
-    assert control.channels == ("gain_ratio",)
-    np.testing.assert_array_equal(control.values[:, 0], 2.0 * control.time_s)
+def test_a_status_whose_names_have_no_units_is_refused():
     with pytest.raises(DataError, match="status of its command at 0 s: channel 'mood' does not end in"):
         run_of("straight", "grass", controller=lambda _: STAND._replace(status={"mood": 1.0}), duration_s=4.0)
