@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.kernels import filled
-from terrain.kinematics.wheels import TWIST
+from terrain.logs.schema import TWIST
 from terrain.robots import load_robot
 from terrain.simulation.plants.tracks import (
     QUIET,
