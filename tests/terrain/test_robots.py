@@ -1,6 +1,7 @@
 """Robots: what each drive is, sections of descriptions, and descriptions that cannot be."""
 
 import math
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -9,34 +10,33 @@ import yaml
 
 from terrain.errors import ConfigError
 from terrain.files.names import data_folder
-from terrain.robots import SkidSteerRobot, SwerveRobot, as_drive, load_robot
+from terrain.robots import Robot, SkidSteerRobot, SwerveRobot, as_drive, load_robot
 
 NAMES = ("agrimaro", "husky", "robotino", "adap2e", "orchard_ugv")
 AGRIMARO, HUSKY, ROBOTINO, CAR, UGV = ROBOTS = [load_robot(name) for name in NAMES]
 
 
-@pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)
-def test_every_drive_is_its_wheels(robot):
-    n = len(robot.wheels)
-    assert robot.wheel_positions_m.shape == (n, 2)
-    assert robot.wheel_directions_rad.shape == robot.steering_zeros_rad.shape == (n,)
-    assert len(robot.rate_channels) == len(robot.wheel_rows) == len(robot.logged_wheels)
-    assert robot.steered_wheels == robot.wheels[: len(robot.steer_rows)]
-    assert (robot.steering_rate_max_radps > 0) == robot.steered
-    if robot not in (CAR, UGV):  # whose sensors are part of their simulations
-        robot.require(*robot.sections)
-    speed_mps = np.array([0.2, -0.1, 0.4])[:n]
-    logged = robot.logged_rates(speed_mps)
-    if robot.by_motor:
-        logged = robot.wheel_speeds_mps(logged / robot.motors.reduction_ratio)
-    np.testing.assert_allclose(logged, speed_mps[-len(robot.logged_wheels) :], rtol=1e-12)
-
-
-def test_what_drives_can_do_follows_from_their_wheels():
+def test_every_drive_is_its_wheels_and_what_it_can_do_follows_from_them():
+    for robot in ROBOTS:
+        n = len(robot.wheels)
+        assert robot.wheel_positions_m.shape == (n, 2)
+        assert robot.wheel_directions_rad.shape == robot.steering_zeros_rad.shape == (n,)
+        assert len(robot.rate_channels) == len(robot.wheel_rows) == len(robot.logged_wheels)
+        assert robot.steered_wheels == robot.wheels[: len(robot.steer_rows)]
+        assert (robot.steering_rate_max_radps > 0) == robot.steered
+        if robot not in (CAR, UGV):  # whose sensors are part of their simulations
+            robot.require(*robot.sections)
+        speed_mps = np.array([0.2, -0.1, 0.4])[:n]
+        logged = robot.logged_rates(speed_mps)
+        if robot.by_motor:
+            logged = robot.wheel_speeds_mps(logged / robot.motors.reduction_ratio)
+        np.testing.assert_allclose(logged, speed_mps[-len(robot.logged_wheels) :], rtol=1e-12)
+        copy = pickle.loads(pickle.dumps(robot))
+        assert copy == robot
+        assert copy.wheels == robot.wheels
     assert [robot.sideways for robot in ROBOTS] == [True, False, True, False, False]
     assert [robot.on_omni_wheels for robot in ROBOTS] == [False, False, True, False, False]
-    assert CAR.rate_channels == ("speed_rear_mps",)
-    assert CAR.steer_channels == ("angle_front_rad",)
+    assert (CAR.rate_channels, CAR.steer_channels) == (("speed_rear_mps",), ("angle_front_rad",))
     positions, directions = ROBOTINO.wheel_positions_m, ROBOTINO.wheel_directions_rad
     np.testing.assert_allclose(np.linalg.norm(positions, axis=1), 0.125, rtol=1e-9)
     lever = positions[:, 0] * np.sin(directions) - positions[:, 1] * np.cos(directions)
@@ -44,18 +44,17 @@ def test_what_drives_can_do_follows_from_their_wheels():
     np.testing.assert_allclose(positions.sum(axis=0), 0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("section", ["body", "motors", "camera", "sensors"])
-def test_a_section_that_is_not_described_is_named_when_it_is_asked_for(section):
-    bare = HUSKY.without(section)
-    assert not bare.describes(section)
-    for ask in (lambda: getattr(bare, section), lambda: bare.require(section)):
-        with pytest.raises(
-            ConfigError, match=f"^robot husky: its description has no section '{section}', which is"
-        ):
-            ask()
-
-
-def test_a_completed_robot_keeps_its_parts_and_adds_neutral_ones():
+def test_a_section_that_is_not_described_is_named_and_a_completed_robot_has_a_neutral_one():
+    for section in ("body", "motors", "camera", "sensors", "steering"):
+        bare = HUSKY.without(section)
+        assert not bare.describes(section)
+        for ask in (getattr, Robot.require):
+            with pytest.raises(
+                ConfigError, match=f"^robot husky: its description has no section '{section}', which is"
+            ):
+                ask(bare, section)
+    with pytest.raises(AttributeError, match="no attribute 'wings'"):
+        HUSKY.wings  # noqa: B018
     bare = AGRIMARO.without("sensors", "camera", "body")
     complete = bare.completed
     assert complete.motors == AGRIMARO.motors
@@ -65,9 +64,6 @@ def test_a_completed_robot_keeps_its_parts_and_adds_neutral_ones():
     assert complete.sensors.imu_latency_s == complete.camera.lever_x_m == bare.encoder_lag_s == 0.0
     assert np.isnan([complete.sensors.gyro_std_radps, complete.camera.speed_std_mps]).all()
     assert AGRIMARO.completed == AGRIMARO
-
-
-def test_a_part_or_a_drive_of_the_wrong_kind_is_refused():
     with pytest.raises(TypeError, match="section 'camera' is a Sensors"):
         AGRIMARO.with_parts(camera=AGRIMARO.sensors)
     assert as_drive(SwerveRobot, AGRIMARO, "") is AGRIMARO
@@ -80,16 +76,8 @@ def test_a_part_or_a_drive_of_the_wrong_kind_is_refused():
     [
         (ROBOTINO, {"track_m": 0.5}, "the footprint allows up to 0.185 m"),
         (ROBOTINO, {"track_m": -0.1}, "wheel_distance_m must be above zero"),
-        (
-            ROBOTINO,
-            {"body": {"com_x_m": 0.2}},
-            "outside the triangle of the wheels: wheel 2 would carry nothing",
-        ),
-        (
-            AGRIMARO,
-            {"body": {"com_x_m": 0.6}},
-            "outside the triangle of the wheels: wheel 1 would carry nothing",
-        ),
+        (ROBOTINO, {"body": {"com_x_m": 0.2}}, "outside the triangle of the wheels: wheel 2 would carry"),
+        (AGRIMARO, {"body": {"com_x_m": 0.6}}, "outside the triangle of the wheels: wheel 1 would carry"),
         (AGRIMARO, {"track_m": 5.0}, "track_m is 5; the footprint allows"),
         (UGV, {"track_width_m": 2.0}, "the tracks would overlap"),
         (CAR, {"com_ahead_m": 2.0}, "between 0 and wheelbase_m"),
@@ -101,11 +89,6 @@ def test_impossible_dimensions_are_refused(robot, change, message):
         robot, change = robot.with_parts(body=replace(robot.body, **change["body"])), {}
     with pytest.raises(ConfigError, match=message):
         replace(robot, **change).check_geometry("robot")
-
-
-@pytest.fixture
-def husky_yaml():
-    return yaml.safe_load((data_folder("robots") / "husky.yaml").read_text())
 
 
 @pytest.mark.parametrize(
@@ -124,17 +107,18 @@ def husky_yaml():
         (lambda d: d.update(drive="legs"), "drive 'legs' is unknown"),
     ],
 )
-def test_a_description_that_cannot_be_is_refused_in_one_sentence(tmp_path, husky_yaml, change, message):
-    change(husky_yaml)
+def test_a_description_that_cannot_be_is_refused_in_one_sentence(tmp_path, change, message):
+    described = yaml.safe_load((data_folder("robots") / "husky.yaml").read_text())
+    change(described)
     path = tmp_path / "mine.yaml"
-    path.write_text(yaml.safe_dump(husky_yaml))
+    path.write_text(yaml.safe_dump(described))
     with pytest.raises(ConfigError, match=r"mine\.yaml") as error:
         load_robot(path)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["rover", "../robots/husky", "none.yaml"])
-def test_an_unknown_robot_is_named(name):
-    with pytest.raises(ConfigError, match=name.replace(".", r"\.")):
-        load_robot(name)
+def test_an_unknown_robot_is_named():
+    for name in ("rover", "../robots/husky", "none.yaml"):
+        with pytest.raises(ConfigError, match=name.replace(".", r"\.")):
+            load_robot(name)

@@ -35,15 +35,16 @@ INTERVALS = {name: (value - 0.05, value + 0.05) for name, value in VALUES.items(
 ONE = {"gyro_scale_ratio": 0.02}, np.array([[4e-6]]), {"gyro_scale_ratio": (0.016, 0.024)}, "me"
 
 
-def described(**changes):
-    content = yaml.safe_load(extended_yaml("agrimaro", VALUES, COV, INTERVALS, "terrain explain, 8 runs"))
-    content["effects"] |= changes
-    return content
+WRITTEN = extended_yaml("agrimaro", VALUES, COV, INTERVALS, "terrain explain, 8 runs")
 
 
-def test_an_extended_file_is_the_robots_own_with_effects_at_its_end(tmp_path):
+def described():
+    return yaml.load(WRITTEN, yaml.CSafeLoader)
+
+
+def test_an_extended_file_is_the_robots_own_with_effects_at_its_end_which_may_have_former_names(tmp_path):
     out, own = tmp_path / "mine.yaml", (data_folder("robots") / "agrimaro.yaml").read_text().rstrip("\n")
-    out.write_text(extended_yaml("agrimaro", VALUES, COV, INTERVALS, "terrain explain, 8 runs"))
+    out.write_text(WRITTEN)
     robot = load_robot(out)
     assert replace(robot, effects={}, effects_cov=np.empty((0, 0))) == AGRIMARO
     assert list(robot.effects) == list(VALUES)
@@ -53,15 +54,20 @@ def test_an_extended_file_is_the_robots_own_with_effects_at_its_end(tmp_path):
     assert out.read_text().startswith(own)
     assert again.startswith(own)
     assert dict(robot_from("again", yaml.safe_load(again)).effects) == ONE[0]
-
-
-def test_a_file_that_is_one_line_is_not_extended(tmp_path):
-    path, content = tmp_path / "flat.yaml", yaml.safe_load((data_folder("robots") / "husky.yaml").read_text())
-    path.write_text(yaml.safe_dump(content))
-    assert robot_from("a", yaml.safe_load(extended_yaml(path, *ONE))).effects
-    path.write_text(yaml.safe_dump(content, default_flow_style=True))
+    values, cov = (
+        {"steering_backlash_rad": 0.03, "camera_yaw_rad": 0.01},
+        1e-6 * np.array([[2.0, 1.0], [1.0, 3.0]]),
+    )
+    text = extended_yaml("agrimaro", values, cov, dict.fromkeys(values, (-0.1, 0.1)), "a test")
+    former = robot_from("old.yaml", yaml.safe_load(text.replace("steering_backlash", "steering_play")))
+    assert former == robot_from("new.yaml", yaml.safe_load(text))
+    np.testing.assert_allclose(former.effects_cov, cov)
+    content = yaml.safe_load((data_folder("robots") / "husky.yaml").read_text())
+    out.write_text(yaml.safe_dump(content))
+    assert robot_from("a", yaml.safe_load(extended_yaml(out, *ONE))).effects
+    out.write_text(yaml.safe_dump(content, default_flow_style=True))
     with pytest.raises(ConfigError, match="one section a line is required"):
-        extended_yaml(path, *ONE)
+        extended_yaml(out, *ONE)
 
 
 def entry(value, unit="ratio"):
@@ -105,19 +111,16 @@ def spoiled(row, column, value):
         ({"region": {"grade_rad": [0.0, math.nan]}}, "two finite numbers are required"),
         ({"region": {"terrains": "grass"}}, "a list of words is required"),
         ({"region": [1]}, "region is [1], a mapping with"),
+        *(([section], "a mapping with schema") for section in (None, [], {}, {R: entry(0.1)})),
     ],
 )
 def test_effects_that_cannot_be_are_refused_in_one_sentence(changes, message):
+    content = described()
+    content["effects"] = content["effects"] | changes if isinstance(changes, dict) else changes[0]
     with pytest.raises(ConfigError, match=r"mine\.yaml: effects") as error:
-        robot_from("mine.yaml", described(**changes))
+        robot_from("mine.yaml", content)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("section", [None, [], {}, {R: entry(0.1)}])
-def test_a_section_without_a_schema_is_refused(section):
-    with pytest.raises(ConfigError, match="a mapping with schema"):
-        robot_from("mine.yaml", described() | {"effects": section})
 
 
 @pytest.mark.parametrize(
@@ -135,39 +138,23 @@ def test_invalid_values_are_not_written(name, cov, interval, message):
         extended_yaml("agrimaro", {name: 0.1}, cov, {name: interval}, "a test")
 
 
-def test_former_names_of_parameters_are_read_as_the_present_ones():
-    values = {"steering_backlash_rad": 0.03, "camera_yaw_rad": 0.01}
-    cov = 1e-6 * np.array([[2.0, 1.0], [1.0, 3.0]])
-    text = extended_yaml("agrimaro", values, cov, dict.fromkeys(values, (-0.1, 0.1)), "a test")
-    former = robot_from("old.yaml", yaml.safe_load(text.replace("steering_backlash", "steering_play")))
-    assert former == robot_from("new.yaml", yaml.safe_load(text))
-    np.testing.assert_allclose(former.effects_cov, cov)
-
-
 # -- What a value rests on: the described number, and whether somebody measured it ----------------------------
 
-NAMES = ("agrimaro", "husky", "warthog", "marmotte")
 
-
-def yaml_of(name):
-    return yaml.safe_load((data_folder("robots") / f"{name}.yaml").read_text())
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_the_extended_number_is_the_one_that_filters_take(name):
+def test_the_extended_number_is_the_one_that_filters_take():
     """Two routes: the number that is reported, and the description with the effect applied."""
-    robot = load_robot(name)
-    for parameter in parameters_of(robot.drive):
-        extended = apply_homes(replace(robot, effects={parameter: 0.1}))
-        for basis in basis_of(robot, parameter, 0.1):
-            if basis.origin is not Origin.LEFT_OUT and parameter not in extended.effects:
-                part = extended.parts[basis.section] if basis.section else extended
-                assert getattr(part, basis.field) == basis.extended
-        assert len(basis_of(robot, parameter)) == len(PARAMETER[parameter].homes)
+    for robot in map(load_robot, ("agrimaro", "husky", "warthog", "marmotte", "robotino")):
+        for parameter in parameters_of(robot.drive):
+            extended = apply_homes(replace(robot, effects={parameter: 0.05}))
+            for basis in basis_of(robot, parameter, 0.05):
+                if basis.origin is not Origin.LEFT_OUT and parameter not in extended.effects:
+                    part = extended.parts[basis.section] if basis.section else extended
+                    assert getattr(part, basis.field) == basis.extended
+            assert len(basis_of(robot, parameter)) == len(PARAMETER[parameter].homes)
 
 
 def test_a_lever_arm_rests_on_what_was_assumed_and_effects_of_the_robot_are_not_applied_twice():
-    content = yaml_of("husky")
+    content = yaml.safe_load((data_folder("robots") / "husky.yaml").read_text())
 
     def lever():
         (basis,) = basis_of(robot_from("husky.yaml", content), "lever_x_m", -0.23)
@@ -202,9 +189,8 @@ def test_a_region_holds_what_was_driven(robot):
     region, truth = region_of([run], robot), run.streams["truth"]
     names = [name for name in truth.channels if name.startswith("wheel_") and name.endswith("radps")]
     speed = np.mean([truth.channel(name) for name in names], axis=0) * robot.wheel_radius_m
-    turn = truth.channel(
-        "yaw_rate_radps"
-    )  # asphalt hardly slips, and skidding takes nothing off the wheels' rate
+    # asphalt hardly slips, and skidding takes nothing off the wheels' rate
+    turn = truth.channel("yaw_rate_radps")
     np.testing.assert_allclose(region.wheel_speed_mps, np.percentile(speed, [1, 99]), atol=0.03)
     np.testing.assert_allclose(region.yaw_rate_radps, np.percentile(turn, [1, 99]), atol=0.05)
     assert region.terrains == ("asphalt",)

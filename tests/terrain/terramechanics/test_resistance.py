@@ -31,7 +31,7 @@ def carried_n(sinkage_m, kc, kphi, n):
     return quad(share, 0.0, entry, epsabs=1e-6, limit=200)[0]
 
 
-@pytest.mark.parametrize("n", [0.13, 0.3, 0.5, 0.7, 0.9, 1.0, 1.1, 1.3])
+@pytest.mark.parametrize("n", [0.13, 0.5, 0.9, 1.0, 1.3])
 @pytest.mark.parametrize("normal_n", [50.0, 300.0])
 def test_the_ground_carries_the_wheel_at_its_sinkage(n, normal_n):
     kc, kphi = 5e3, 1.5e6
@@ -57,21 +57,13 @@ def test_sinkage_is_a_root_of_the_load(n, factor, normal_n, modulus):
     assert again == pytest.approx(factor * once, rel=1e-9)
 
 
-@pytest.mark.parametrize("name", ["clay", "tilled_loam", "dry_sand"])
-def test_compaction_is_the_work_of_the_pressure(name):
-    soil = load_soil(name)
-    modulus = soil.kc_npmn1 + WIDTH_M * soil.kphi_npmn2
-    sinkage_m = rigid_wheel_sinkage(300.0, RADIUS_M, modulus, soil.sinkage_exponent_ratio)
-    work, _ = quad(
-        lambda z: (
-            WIDTH_M * bekker_pressure(z, WIDTH_M, soil.kc_npmn1, soil.kphi_npmn2, soil.sinkage_exponent_ratio)
-        ),
-        0.0,
-        sinkage_m,
-    )
-    assert compaction_resistance(sinkage_m, modulus, soil.sinkage_exponent_ratio) == pytest.approx(
-        work, rel=1e-6
-    )
+def test_compaction_is_the_work_of_the_pressure():
+    for soil in map(load_soil, ("clay", "tilled_loam", "dry_sand")):
+        kc, kphi, n = soil.kc_npmn1, soil.kphi_npmn2, soil.sinkage_exponent_ratio
+        modulus = kc + WIDTH_M * kphi
+        sinkage_m = rigid_wheel_sinkage(300.0, RADIUS_M, modulus, n)
+        work = WIDTH_M * quad(bekker_pressure, 0.0, sinkage_m, (WIDTH_M, kc, kphi, n))[0]
+        assert compaction_resistance(sinkage_m, modulus, n) == pytest.approx(work, rel=1e-6)
 
 
 def test_slip_sinks_the_wheel_unless_it_is_absent():
@@ -93,8 +85,5 @@ def test_the_arc_takes_over_from_the_tyre_and_ends_at_the_axle():
     chord = np.sqrt(2 * RADIUS_M * depths[(lengths > 0.12) & (depths < RADIUS_M)])
     np.testing.assert_allclose(2 * RADIUS_M * np.sin(arc / RADIUS_M / 2), chord)
     assert lengths[-1] == pytest.approx(RADIUS_M * math.pi / 2)
-
-
-def test_rolling_resistance_needs_a_load():
     assert rolling_resistance(300.0, 0.05) == 15.0
     assert rolling_resistance(-300.0, 0.05) == 0.0

