@@ -48,9 +48,9 @@ ALLOWED: dict[str, tuple[str, ...]] = {
 SELF = ("tests/house/test_words.py", "docs/glossary.md")
 
 
-def private_words(text: str) -> list[str]:
-    """Return each private word of a text."""
-    return [found.group(0) for found in ANY_PRIVATE_WORD.finditer(text)]
+def private_words(text: str) -> list[tuple[int, str]]:
+    """Return each private word of a text, with the number of its line."""
+    return [(text.count("\n", 0, it.start()) + 1, it.group(0)) for it in ANY_PRIVATE_WORD.finditer(text)]
 
 
 def tracked_files() -> list[str]:
@@ -69,11 +69,7 @@ def test_no_private_word_is_written():
         text = (ROOT / name).read_text(encoding="utf-8")
         for allowed in ALLOWED.get(name, ()):
             text = text.replace(allowed, "")
-        found += [
-            f"{name}:{number}: {word}"
-            for number, line in enumerate(text.splitlines(), 1)
-            for word in private_words(line)
-        ]
+        found += [f"{name}:{number}: {word}" for number, word in private_words(text)]
     assert found == [], f"{len(found)} private words"
 
 

@@ -12,6 +12,7 @@ from terrain.estimation.wheel_slip import STALE_AFTER_S, slip_figures, wheel_sli
 from terrain.kinematics.camera import odometry_stream
 from terrain.records import ABSENT, RunLog, SlipTrack, StateTrack, Stream
 from terrain.robots import load_robot
+from terrain.signals import low_pass
 from terrain.slip import slip_angle, slip_ratio
 
 ROBOT = load_robot("agrimaro")
@@ -26,19 +27,9 @@ WITHOUT = (*MOTION, *STEER)
 def make_track(mean, states, cov=None, age_s=0.0, dt_s=0.02):
     mean = np.atleast_2d(mean)
     n, d = mean.shape
-    none = np.zeros((n, 1))
-    return StateTrack(
-        np.arange(n) * dt_s,
-        mean,
-        np.broadcast_to(np.zeros((d, d)) if cov is None else cov, (n, d, d)),
-        states,
-        none,
-        none,
-        none + ABSENT,
-        ("camera_speed",),
-        np.broadcast_to(age_s, n),
-        0.0,
-    )
+    cov, none = np.broadcast_to(np.zeros((d, d)) if cov is None else cov, (n, d, d)), np.zeros((n, 1))
+    used = none, none, none + ABSENT, ("camera_speed",)
+    return StateTrack(np.arange(n) * dt_s, mean, cov, states, *used, np.broadcast_to(age_s, n), 0.0)
 
 
 def make_table(track, wheel_speed_mps, robot=ROBOT):
@@ -100,7 +91,7 @@ def test_slip_angle_is_positive_to_the_left_for_both_rolling_directions():
 # from a filter's track
 
 
-def test_wheel_speed_uncertainty_is_by_default_the_robots_own():
+def test_uncertainty_of_wheel_speeds_is_by_default_the_robots_own_and_encoders_alone_have_no_slip():
     track = make_track([0.8, *[0.0] * 5], WITHOUT)
     table = make_table(track, 1.0)
     wheel_speed_std = wheel_slip(track, table, ROBOT).slip_std[0, 0] / 0.8
@@ -109,9 +100,19 @@ def test_wheel_speed_uncertainty_is_by_default_the_robots_own():
     count = np.floor(np.arange(0, 4, dt) * 5.0 / step)
     seen = lfilter([1 - np.exp(-dt / 0.05)], [1, -np.exp(-dt / 0.05)], np.diff(count) * step / dt)
     assert wheel_speed_std == pytest.approx(seen[5000:].std() * ROBOT.wheel_radius_m, rel=0.03)
-    nameless = ROBOT.without("sensors")
-    assert np.isnan(wheel_slip(track, table, nameless).slip_std).all()
-    np.testing.assert_allclose(wheel_slip(track, table, nameless).slip_ratio, 0.2)
+    nameless = wheel_slip(track, table, ROBOT.without("sensors"))
+    assert np.isnan(nameless.slip_std).all()
+    np.testing.assert_allclose(nameless.slip_ratio, 0.2)
+    # a filter of encoders believes the wheels, at whatever speed the robot goes: a figure to show, and no slip
+    track = make_track(np.tile([1.0, *[0.0] * 5], (5, 1)), WITHOUT, age_s=np.inf)
+    table = make_table(track, 1.001)
+    slip = wheel_slip(track, table, ROBOT)
+    assert np.isnan([slip.slip_ratio, slip.slip_std]).all()
+    np.testing.assert_allclose(wheel_slip(track, table, ROBOT, blind=True).slip_ratio, 0.001, atol=1e-6)
+    # with a slip ratio for a state too: nothing determines it
+    states = np.tile([1.0, *[0.0] * 5, *[0.4] * 3], (5, 1))
+    more = make_track(states, (*WITHOUT, "slip_1_ratio", "b", "c"), age_s=np.inf)
+    assert np.isnan(wheel_slip(more, table, ROBOT).slip_ratio).all()
 
 
 def test_slip_is_unknown_where_the_ground_was_never_seen_and_stale_where_not_lately():
@@ -122,32 +123,14 @@ def test_slip_is_unknown_where_the_ground_was_never_seen_and_stale_where_not_lat
     track = make_track(mean, WITH_SLIP, cov, age)
     table = make_table(track, 1.0)
     slip = wheel_slip(track, table, ROBOT)
-    np.testing.assert_array_equal(np.isnan(slip.slip_ratio).all(axis=1), never)
-    np.testing.assert_array_equal(np.isnan(slip.slip_std).any(axis=1), never)
-    np.testing.assert_array_equal(slip.stale, stale)
+    # a filter that leans on the wheels then would say 0
+    leaning = wheel_slip(make_track(mean[:, :6], WITHOUT, cov[:, :6, :6], age), table, ROBOT)
+    for found, unknown in ((slip, never), (leaning, stale)):
+        np.testing.assert_array_equal(np.isnan(found.slip_ratio).all(axis=1), unknown)
+        np.testing.assert_array_equal(np.isnan(found.slip_std).any(axis=1), unknown)
+        np.testing.assert_array_equal(found.stale, stale)
     np.testing.assert_allclose(slip.slip_ratio[~never], 0.125)
     assert (np.diff(slip.slip_std[2:, 0]) > 0).all()  # as the state's does
-    # a filter that leans on the wheels then would say 0
-    leaning = make_track(mean[:, :6], WITHOUT, cov[:, :6, :6], age)
-    encoders = wheel_slip(leaning, table, ROBOT)
-    np.testing.assert_array_equal(np.isnan(encoders.slip_ratio).all(axis=1), stale)
-    np.testing.assert_array_equal(np.isnan(encoders.slip_std).all(axis=1), stale)
-    np.testing.assert_array_equal(encoders.stale, stale)
-
-
-def test_a_filter_of_encoders_alone_has_no_slip_but_a_figure_to_show():
-    """It believes the wheels, at whatever speed the robot goes."""
-    track = make_track(np.tile([1.0, *[0.0] * 5], (5, 1)), WITHOUT, age_s=np.inf)
-    table = make_table(track, 1.001)
-    slip = wheel_slip(track, table, ROBOT)
-    assert np.isnan(slip.slip_ratio).all()
-    assert np.isnan(slip.slip_std).all()
-    np.testing.assert_allclose(wheel_slip(track, table, ROBOT, blind=True).slip_ratio, 0.001, atol=1e-6)
-    # with a slip ratio for a state too: nothing determines it
-    more = make_track(
-        np.tile([1.0, *[0.0] * 5, *[0.4] * 3], (5, 1)), (*WITHOUT, "slip_1_ratio", "b", "c"), age_s=np.inf
-    )
-    assert np.isnan(wheel_slip(more, table, ROBOT).slip_ratio).all()
 
 
 @pytest.mark.parametrize("speed_name", ["speed_x_mps", "speed_mps"])
@@ -159,11 +142,9 @@ def test_sides_of_a_skid_steered_robot(speed_name, monkeypatch):
     slip = wheel_slip(track, make_table(track, [left / 0.8, right * 0.9], HUSKY), HUSKY)
     np.testing.assert_allclose(slip.slip_ratio, [[0.2, -0.1]])
     assert slip.wheels == ("left", "right")
-    ground_std = np.sqrt(1e-4 + half**2 * 4e-4)
-    wheel_speed = left / 0.8
-    np.testing.assert_allclose(
-        slip.slip_std[0, 0], np.hypot(ground_std / wheel_speed, 0.01 * left / wheel_speed**2)
-    )
+    ground_std, wheel_speed = np.sqrt(1e-4 + half**2 * 4e-4), left / 0.8
+    std = np.hypot(ground_std / wheel_speed, 0.01 * left / wheel_speed**2)
+    np.testing.assert_allclose(slip.slip_std[0, 0], std)
 
 
 def test_tracks_and_tables_that_do_not_match_are_refused():
@@ -179,31 +160,22 @@ def test_tracks_and_tables_that_do_not_match_are_refused():
 # through the measurements: a start as in thesis 7.2.2
 
 
-def lagged(speed, tau, dt=0.001):
-    """First-order lag of a signal from rest, in small steps."""
-    out = np.zeros_like(speed)
-    for k in range(1, speed.size):
-        out[k] = out[k - 1] + (speed[k - 1] - out[k - 1]) * dt / tau
-    return out
-
-
 def start_of_a_run(slip, camera_s=0.0):
     """Return a 1 m/s^2 start to 1 m/s: encoders behind 50 ms, a camera behind by ``camera_s``."""
     rng = np.random.default_rng(0)
     fine = np.arange(0, 4.0, 0.001)
     speed = np.clip(fine - 0.5, 0.0, 1.0)
-    wheel_speed = lagged(speed / (1 - slip), 0.05)
+    wheel_speed = low_pass(speed / (1 - slip), 0.001, 0.05)
     t = np.arange(200) / 50
     motor = np.interp(t, fine, wheel_speed) / ROBOT.wheel_radius_m * ROBOT.motors.reduction_ratio
     motor = motor + ROBOT.sensors.motor_std_radps * rng.standard_normal(motor.size)
     wheels = Stream(t, np.tile(motor[:, None], 3), [f"motor_{i}_radps" for i in (1, 2, 3)])
     t = np.arange(800) / 200
-    seen = np.interp(t - 0.006, fine, lagged(speed, camera_s) if camera_s else speed)
+    seen = np.interp(t - 0.006, fine, low_pass(speed, 0.001, camera_s))
     seen = np.column_stack([seen, 0 * t]) + 0.001 * rng.standard_normal((t.size, 2))
     zero, attitude = np.zeros(t.size), 1e-5 * rng.standard_normal((t.size, 3))
-    pose = odometry_stream(
-        t, np.zeros((t.size, 2)), attitude, np.column_stack([seen, zero]), ROBOT.camera, 0.0
-    )
+    twist = np.column_stack([seen, zero])
+    pose = odometry_stream(t, np.zeros((t.size, 2)), attitude, twist, ROBOT.camera, 0.0)
     return RunLog("start", "agrimaro", {"wheels": wheels, "odometry": pose})
 
 
