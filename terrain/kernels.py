@@ -21,7 +21,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dis import get_instructions
 from enum import Enum
-from functools import cache
+from functools import cache, partial
 from hashlib import sha256
 from operator import attrgetter
 from pathlib import Path
@@ -69,7 +69,7 @@ def njit(*signatures: Any, **options: Any) -> Any:
     3.0
     """
     if not (len(signatures) == 1 and isinstance(signatures[0], FunctionType)):
-        return lambda function: _compiled(function, signatures, options)
+        return partial(_compiled, signatures=signatures, options=options)
     return _compiled(signatures[0], (), options)
 
 
