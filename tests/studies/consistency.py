@@ -28,12 +28,7 @@ SCENARIOS = ("survey", "starts", "complex")
 FILTER = "vio15"
 RUNS_A_SCENARIO = 4
 
-GROUPS = {
-    "position": "position",
-    "yaw": "yaw",
-    "speed": "speed",
-    "yaw_rate": "yaw rate",
-    "accel": "accel",
+GROUPS = {name: name.replace("_", " ") for name in ("position", "yaw", "speed", "yaw_rate", "accel")} | {
     "steer": "steering",
     "gyro_bias": "gyro bias",
     "slip_speed": "slip speed",
