@@ -88,11 +88,15 @@ def test_what_is_not_accepted_is_named(changed, problem):
 COMMAND = {"wheel_radps": [0.0], "steer_rad": [0.0], "twist": [0.0], "valid_s": 1.0}
 
 
+def robot_of(number=0, end_s=0.0):
+    message = {"streams": {"imu": [[0.01], [[0.0]]]}, "time_s": 0.01}
+    messages = [message, {**message, "time_s": end_s}] if end_s else [message]
+    return soak._Robot(number, {"imu": ["gyro_z_radps"]}, messages, soak._Seen(), 0)
+
+
 @pytest.mark.parametrize(("end_s", "n"), [(2005.0, 0), (5.0, 1), (3005.0, 1)])
 def test_a_window_by_another_robots_clock_is_one_of_another_robot(end_s, n):
-    message = {"streams": {"imu": [[0.01], [[0.0]]]}, "time_s": 0.01}
-    messages = [message, {**message, "time_s": 40.0}]
-    robot = soak._Robot(2, {"imu": ["gyro_z_radps"]}, messages, soak._Seen(), 0)
+    robot = robot_of(2, 40.0)
     assert [one.time_s for one in robot._messages] == pytest.approx([0.0, 39.99])
     answer = {"command": COMMAND, "observation": {"window": {"start_s": end_s - 2.0, "end_s": end_s}}}
     robot._judge(answer, time.monotonic())
@@ -118,7 +122,6 @@ def test_an_answer_is_that_of_its_request(monkeypatch, answers, steps, unanswere
             step = {"type": "step", "time_s": float(what[-1]), "command": COMMAND}
             return msgpack.packb({**step, "observation": {"window": None}})
 
-    message = {"streams": {"imu": [[0.0], [[0.0]]]}, "time_s": 0.0}
-    robot = soak._Robot(0, {"imu": ["gyro_z_radps"]}, [message], soak._Seen(), 0)
+    robot = robot_of()
     asyncio.run(robot._answer(Socket(), 2.0, time.monotonic()))
     assert (robot._seen.steps, robot._seen.unanswered) == (steps, unanswered)

@@ -12,7 +12,6 @@ import pytest
 
 from features.windows import cut_windows
 from pipelines.live.classifying import AT_MOST, MAX_WAITING, Classifier, WindowOutput, classify_window
-from pipelines.live.observer import Observer
 from terrain.estimation.live import LiveFilter
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.replay import replay
@@ -127,6 +126,7 @@ def starts(robot, n):
 
 
 def test_taking_waits_for_nothing_and_each_robot_gets_its_outputs_in_order(gate):
+    """That windows on a thread are those at once is tested with a service."""
     event, thread = gate
     busy, other = begun(thread), begun(thread)
     assert [take(busy, 2.0 * k) for k in range(40)] == [[]] * 40
@@ -177,16 +177,3 @@ def test_models_are_changed_in_order_and_an_unforeseen_error_costs_one_window(ga
         thread.submit(robot._work_beside)
     assert [one.nearest for one in outputs(robot, 4)] == ["first", "second", "third", "third"]
     assert robot.dropped == {"window: lost to a fault, KeyError": 1}
-
-
-def test_on_a_thread_a_robot_gets_the_windows_that_it_would_get_at_once(mower_model, two_drives):
-    run, thread = two_drives[4], ThreadPoolExecutor(1)
-    at_once, beside = Observer(mower_model), Observer(mower_model, thread=thread)
-    desired, found = [], []
-    for sample in replay(run):
-        desired += at_once.update(sample.readings)
-        found += beside.update(sample.readings)
-    until(lambda: found.extend(beside.update({})) or len(found) >= len(desired))
-    assert [one[:4] for one in found] == [one[:4] for one in desired]
-    assert beside.belief.terrain == "b"
-    thread.shutdown(cancel_futures=True)

@@ -99,8 +99,10 @@ def test_slip_by_an_observer_of_tracked_robots_is_a_feature_in_the_log_and_live(
     assert observer.estimate.status.label == "standing"  # at the end of the drive
 
 
-def test_a_robot_without_a_description_is_observed_by_its_channels(mower_model, two_drives):
-    """A terrain that nothing confirms becomes unknown, also where no wheels are measured."""
+def test_a_terrain_that_nothing_confirms_becomes_unknown_also_where_no_wheels_are_measured(
+    mower_model, two_drives
+):
+    """Of a robot without a description, which is observed by its channels."""
     run, observer = two_drives[4], Observer(mower_model)
     assert_same(observed(observer, run), predict([run], mower_model, TABLE).windows)
     assert observer.belief.terrain == "b"

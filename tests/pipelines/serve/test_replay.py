@@ -2,10 +2,9 @@
 
 import itertools
 import json
+import os
 import signal
-import subprocess
-import sys
-from threading import Event
+import threading
 from time import perf_counter
 
 import numpy as np
@@ -13,6 +12,7 @@ import pytest
 
 from pipelines.learn.model_file import write_model
 from pipelines.learn.predict import predict
+from pipelines.serve import replay
 from pipelines.serve.replay import chain_of_run, replay_run
 from pipelines.serve.serve import Settings
 from pipelines.serve.serve import run as serve
@@ -38,7 +38,7 @@ def grass():
 
 def replayed(run, model, stop_at_s=np.inf, **settings):
     """The replayed run, and when each second of it was passed."""
-    moments, stop = [], Event()
+    moments, stop = [], threading.Event()
 
     def progress(task, done, total):
         moments.append((perf_counter(), done))
@@ -128,14 +128,15 @@ def test_serve_replays_all_runs_of_a_folder_as_predict_and_prints_changes(
     assert f"{result.n_windows} windows in 4" in str(result.report)
 
 
-@pytest.mark.slow
-def test_a_signal_ends_the_command_with_a_summary(logs, husky_folder, tmp_path):
-    words = f"serve --replay {logs} --speed 1 --model {husky_folder} --json {tmp_path}/out.json".split()
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    process = subprocess.Popen([sys.executable, "-u", "-m", "pipelines.cli", *words], **pipes)
-    assert "believed" in process.stdout.readline()
-    process.send_signal(signal.SIGINT)  # once, and whatever is compiled just then
-    out, _ = process.communicate(timeout=60.0)
-    assert process.returncode == 130
+def test_a_signal_ends_the_command_with_a_summary(logs, husky_folder, tmp_path, terrain, monkeypatch):
+    def begun(*given):
+        threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+        return replay_run(*given)
+
+    monkeypatch.setattr(replay, "replay_run", begun)
+    file = tmp_path / "out.json"
+    words = f"serve --replay {logs} --speed 1 --model {husky_folder} --json {file}"
+    code, out, _ = terrain(*words.split())
+    assert code == 130
     assert "stopped before the end" in out
-    assert 1.0 < json.loads((tmp_path / "out.json").read_text())["duration_s"] < 20.0
+    assert 0.1 < json.loads(file.read_text())["duration_s"] < 20.0
