@@ -159,13 +159,13 @@ class Chain:
 
     def _believe(self, sample: Sample, estimates: Sequence[Estimate]) -> OutputStatus:
         """Update the belief by what the source finds in a sample; return what its last output was."""
-        n_refused, status, switching = self.source.n_refused, OutputStatus.NONE, self.switching
+        status, switching = OutputStatus.NONE, self.switching
         if self.source.settled:
             switching = switching._replace(dwell_s=0.0, probability_least=0.0)
         for found in self.source.update(sample, estimates):
             self.belief = update(self.belief, *found, switching)
             status = output_status(found.terrain, found.probability, switching)
-        return OutputStatus.REFUSED if self.source.n_refused > n_refused else status
+        return OutputStatus.REFUSED if any(each.refused for each in self.source.outputs) else status
 
     def state(self, now_s: float) -> LiveState:
         """Return what is worth keeping over a restart, at a time in seconds since 1970."""

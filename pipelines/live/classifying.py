@@ -219,7 +219,6 @@ class Classifier(TerrainSource):
             self._do_what_waits()
         self.outputs = outputs = [self._finished.popleft() for _ in range(len(self._finished))]
         self.failed.update(output.refused for output in outputs if output.refused)
-        self.n_refused = self.failed.total()
         return outputs
 
     def _work(self) -> None:

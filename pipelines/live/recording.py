@@ -70,6 +70,7 @@ class SessionRecorder:
     ----------
     files : that were begun, in order
     settled : set when the thread is done with the recording
+    status : ``recording``, ``finished``, or ``stopped:`` and why
 
     Raises
     ------
@@ -108,15 +109,10 @@ class SessionRecorder:
         self._file: BinaryIO | None = None  # that is written, and its run
         self._run: RunRecorder
         self._origin_s = np.nan
-        self._ended = ""  # why no more is taken; empty while it is
+        self.status = RECORDING
         self.settled = threading.Event()
         self.files: list[Path] = []
         writer.add(self)
-
-    @property
-    def status(self) -> str:
-        """``recording``, ``finished``, or ``stopped:`` and why."""
-        return self._ended or RECORDING
 
     def readings(self, readings: Mapping[str, Reading]) -> None:
         """Record what was measured, by stream, in the columns of its channels."""
@@ -146,7 +142,7 @@ class SessionRecorder:
         self._end(FINISHED)
 
     def _put(self, stream: str, content: Array | WindowOutput) -> None:
-        if self._ended:
+        if self.status != RECORDING:
             return
         n_bytes = _OVERHEAD_BYTES + getattr(content, "nbytes", 5 * _OVERHEAD_BYTES)
         with self._lock:
@@ -156,12 +152,13 @@ class SessionRecorder:
             self._end("stopped: the disk is too slow")
 
     def _end(self, why: str) -> None:
-        self._ended = self._ended or why
+        if self.status == RECORDING:
+            self.status = why
         self._writer.wake()
 
     def work(self) -> bool:
         """Write what waits; say whether there is more to come.  Called by the thread, and by nothing else."""
-        ended = bool(self._ended)  # seen before the samples are taken, so that all of them are
+        ended = self.status != RECORDING  # seen before the samples are taken, so that all of them are
         try:
             self._flush()
             if self._file is not None and (ended or self._file.tell() > PART_BYTES):
@@ -169,17 +166,17 @@ class SessionRecorder:
                 os.fsync(self._file.fileno())
                 self._file.close()
                 self._file, self._dropped = None, Counter()
-            if ended and not self.files and self._ended == FINISHED:
-                self._ended = NOTHING_KEPT
+            if ended and not self.files and self.status == FINISHED:
+                self.status = NOTHING_KEPT
         except OSError as error:
             ended, reason = True, f"cannot be written ({error.strerror or error})"
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 reason = "no space left on the disk"
             elif isinstance(error, FileNotFoundError):
                 reason = "the folder was removed"
-            self._ended = f"stopped: {reason}"
+            self.status = f"stopped: {reason}"
         except Exception as error:  # of this recording: the thread serves the others
-            ended, self._ended = True, f"stopped: {type(error).__name__}: {error}"
+            ended, self.status = True, f"stopped: {type(error).__name__}: {error}"
         if ended:
             if self._file is not None:
                 with suppress(OSError):  # a full disk: what was written before stays readable

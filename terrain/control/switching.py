@@ -170,12 +170,10 @@ class TerrainSource:
     ----------
     certain : each output holds until the next, however long
     settled : each output is accepted at once, without a dwell
-    n_refused : number of windows without an output
     model, outputs : that classifies, and what it gave at the last sample; none of a source without one
     """
 
     certain = settled = False
-    n_refused = 0
     model: Any = None
     outputs: Sequence[Any] = ()
 

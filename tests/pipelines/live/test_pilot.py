@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -108,7 +109,8 @@ def test_a_classifier_whose_probability_never_suffices_is_reported_and_one_that_
         statuses = [live.step(Sample(k / 50, np.zeros(3), {})).status for k in range(100)]
         assert {status["output_code"] for status in statuses} == {output}
         assert (live.belief.terrain == "grass") is (output is OutputStatus.ACCEPTED)
-    del source.update
+    source.update, source.outputs = lambda sample, _: [], [SimpleNamespace(refused="Input contains NaN.")]
+    assert live.step(Sample(2.0, np.zeros(3), {})).status["output_code"] == OutputStatus.REFUSED
     for sample in recorded(15.0):
         live.step(sample._replace(time_s=sample.time_s + 2.0))
     assert (live.belief.terrain, live.step(sample).status["terrain_code"]) == ("", -1.0)

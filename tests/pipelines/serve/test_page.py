@@ -4,6 +4,7 @@ import shutil
 import threading
 import time
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -20,35 +21,8 @@ SENT = {**CHANNELS, "wheels": [*CHANNELS["wheels"], *MOTORS]}
 TOKEN = "a token of the page's test"
 MARKUP = "<img src=x onerror=document.title='run'>"
 
-CONTRAST = """() => {
-  const linear = (v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4;
-  const light = (text) => {
-    const [r, g, b] = text.match(/[\\d.]+/g).slice(0, 3).map((v) => linear(v / 255));
-    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
-  };
-  const back = (node) => {
-    for (; node; node = node.parentElement) {
-      const colour = getComputedStyle(node).backgroundColor;
-      if (!/, 0\\)$/.test(colour) && colour !== "transparent") return colour;
-    }
-    return "rgb(255, 255, 255)";
-  };
-  return [...document.querySelectorAll("body *")].filter((node) =>
-    node.checkVisibility() && [...node.childNodes].some((one) => one.nodeType === 3 && one.data.trim())
-  ).map((node) => {
-    const [a, b] = [light(getComputedStyle(node).color), light(back(node))].sort();
-    return [(b + 0.05) / (a + 0.05), node.id || node.tagName, node.textContent.slice(0, 30)];
-  }).sort((a, b) => a[0] - b[0])[0];
-}"""
-"""The lowest contrast of all text that is seen, and where."""
-
-INK = """(canvas) => {
-  const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
-  const seen = new Set();
-  for (let k = 0; k < data.length; k += 4) if (data[k + 3]) seen.add(data.slice(k, k + 3).join());
-  return seen.size;
-}"""
-"""Number of colours of a canvas."""
+CHECKS = Path(__file__).with_name("page_checks.js")
+INK = "(canvas) => inkOf(canvas)"  #: Number of colours of a canvas
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +43,7 @@ def opened(browser):
     def of(service, complaints=True, **options):
         context = browser.new_context(**options)
         contexts.append(context)
+        context.add_init_script(path=CHECKS)
         page = context.new_page()
         page.set_default_timeout(10_000)
         page.on("pageerror", lambda error: faults.append(str(error)))
@@ -113,7 +88,8 @@ def shows(page, place, text, timeout_s=8.0):
 
 
 def assert_readable(page):
-    assert page.evaluate(CONTRAST)[0] >= 4.5, page.evaluate(CONTRAST)
+    found = page.evaluate("lowestContrast()")
+    assert found[0] >= 4.5, found
 
 
 def test_a_robot_is_shown_with_terrain_target_and_model_and_markup_is_text(service, opened):
