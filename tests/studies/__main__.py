@@ -15,38 +15,33 @@ from pipelines.cli.options import OneFile  # noqa: E402
 from pipelines.cli.table import Command  # noqa: E402
 from terrain.errors import TerrainError  # noqa: E402
 
-STUDIES: dict[str, tuple[str, str]] = {
-    "consistency": ("studies.consistency", "NEES and coverage of slip by terrain, over simulated runs"),
-    "long-drives": (
-        "studies.long_drives",
-        "yaw of a filter on long drives, and after the loss of the camera",
-    ),
-    "intervals": ("studies.intervals", "coverage of the intervals of all that is identified"),
-    "labels": ("studies.labels", "what chosen questions and self-training gain, from few labels"),
-    "trials": (
-        "studies.trials",
-        "hide effects in simulated runs, diagnose them blindly, count what is right",
-    ),
-    "live": ("studies.live", "latency of the live chain by stage, and of the service with many robots"),
-    "soak": ("studies.soak", "the service for minutes or hours under robots that misbehave at random"),
-    "scale": ("studies.scale", "features of ever more runs with ever more processes: time and memory"),
-    "figures": ("studies.figures", "the tables of measured figures, from their records"),
-    "mutants": ("studies.mutants", "faults put in on purpose: whether the tests notice them"),
+STUDIES = {
+    "consistency": "NEES and coverage of slip by terrain, over simulated runs",
+    "long-drives": "yaw of a filter on long drives, and after the loss of the camera",
+    "intervals": "coverage of the intervals of all that is identified",
+    "labels": "what chosen questions and self-training gain, from few labels",
+    "trials": "hide effects in simulated runs, diagnose them blindly, count what is right",
+    "live": "latency of the live chain by stage, and of the service with many robots",
+    "soak": "the service for minutes or hours under robots that misbehave at random",
+    "scale": "features of ever more runs with ever more processes: time and memory",
+    "figures": "the tables of measured figures, from their records",
+    "mutants": "faults put in on purpose: whether the tests notice them",
 }
-"""By name: module, and a line of help.  A module has ``EXAMPLE``, ``Settings``, ``run`` and ``report``."""
+"""A line of help by name, which is that of the module: it has ``EXAMPLE``, ``Settings``, ``run`` and ``report``."""
 
 
 def main(words: list[str]) -> int:
     """Run a study; list them without a name.  Exit code 2 for a mistake, 1 where something is not accepted."""
     if not words or words[0] in ("-h", "--help"):
         print("python tests/studies NAME [options]\n")
-        for name, (_, text) in STUDIES.items():
+        for name, text in STUDIES.items():
             print(f"  {name:<13}{text}")
         return 0
     try:
         if words[0] not in STUDIES:
             raise click.UsageError(f"there is no study {words[0]!r}; there are {', '.join(STUDIES)}")
-        command = OneFile(Command("", words[0], *STUDIES[words[0]]))
+        module = f"studies.{words[0].replace('-', '_')}"
+        command = OneFile(Command("", words[0], module, STUDIES[words[0]]))
         prog_name = f"python tests/studies {words[0]}"
         options: dict[str, Any] = {"standalone_mode": False, "help_option_names": ["-h", "--help"]}
         result: Any = command.main(words[1:], prog_name, **options)

@@ -40,9 +40,8 @@ COVERAGE_HEADING = "coverage of slip"
 
 
 class TerrainConsistency(NamedTuple):
-    """Consistency of a filter on a terrain, means over runs with their 95 % intervals."""
+    """Consistency of a filter in ``n_runs`` runs on a terrain, means over runs with their 95 % intervals."""
 
-    #: terrain, n_runs: of how many runs
     terrain: str
     n_runs: int
     nees: dict[str, MeanInterval]  #: a state, by group of states (:data:`GROUPS`); 1 is consistent
@@ -156,10 +155,9 @@ def run(settings: Settings, progress: Progress = silent) -> Consistency:
 
 def report(result: Consistency) -> Report:
     """Return a line a terrain, a column a group of states, and the coverage of slip."""
-    rows = result.consistency
+    rows, title = result.consistency, "NEES a state (1 is consistent), and coverage of 95 % intervals of slip"
     groups = [key for key in GROUPS if key in rows[0].nees]
     coverage = [row.slip_coverage.mean for row in rows if row.slip_coverage.mean is not None]
-    lowest = format_value(min(coverage, default=None), ".1%")
     cells = tuple(
         (row.terrain, *(shown(value) for value in (*(row.nees[key] for key in groups), row.slip_coverage)))
         for row in rows
@@ -167,13 +165,9 @@ def report(result: Consistency) -> Report:
     columns = ("terrain", *(GROUPS[key] for key in groups), COVERAGE_HEADING)
     return Report(
         f"Consistency of {result.filter}",
-        f"On the worst of {len(rows)} terrains {lowest} of the slips lie in their 95 % interval, in "
-        f"{rows[0].n_runs} runs a terrain.",
-        parts=(
-            Table(
-                columns, cells, title="NEES a state (1 is consistent), and coverage of 95 % intervals of slip"
-            ),
-        ),
+        f"On the worst of {len(rows)} terrains {format_value(min(coverage, default=None), '.1%')} of the slips lie in "
+        f"their 95 % interval, in {rows[0].n_runs} runs a terrain.",
+        parts=(Table(columns, cells, title=title),),
     )
 
 

@@ -418,14 +418,8 @@ def report(result: IntervalsResult) -> Report:
     """Return the coverage of each number."""
     low, high = (f(row.coverage - row.stated for row in result.rows) for f in (min, max))
     columns = (
-        "use",
-        "number",
-        "repeats",
-        Column("coverage", ".3f"),
-        Column("95 %", ".3f"),
-        Column("stated", ".2f"),
-        Column("median error", ".3g"),
-        Column("largest", ".3g"),
+        *("use", "number", "repeats", Column("coverage", ".3f"), Column("95 %", ".3f")),
+        *(Column("stated", ".2f"), Column("median error", ".3g"), Column("largest", ".3g")),
     )
     return Report(
         "Intervals of what is identified",

@@ -21,21 +21,8 @@ from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
 from pipelines.report.tree import Column, Pairs, Report, Table
-from studies.service import (
-    ROBOT,
-    Packed,
-    Spread,
-    drive,
-    drive_all,
-    hello,
-    messages_of,
-    model_folder,
-    packed,
-    sent_channels,
-    service_process,
-    spread,
-    study_drive,
-)
+from studies import service as serving
+from studies.service import ROBOT, Packed, Spread, packed, spread
 from terrain.estimation.estimate import enriched, estimate_run
 from terrain.logs.replay import replay
 from terrain.records import RunLog, Windows
@@ -152,10 +139,10 @@ def window_times_ms(windows: Windows, model: Any) -> Spread:
 
 def run(settings: Settings, progress: Progress = silent) -> LiveLatencies:
     """Measure the live chain and the service on this machine."""
-    robot, log = load_robot(ROBOT), study_drive(settings.seed)
+    robot, log = load_robot(ROBOT), serving.study_drive(settings.seed)
     n_stages = 5 + len(SHARES)
     with TemporaryDirectory() as folder:
-        uri = model_folder(settings.model, settings.seed, Path(folder) / "model")
+        uri = serving.model_folder(settings.model, settings.seed, Path(folder) / "model")
         model = read_model(uri)
         progress("live", 1, n_stages)
         step_times_us(robot, model, log)  # compiles and loads
@@ -176,20 +163,20 @@ def run(settings: Settings, progress: Progress = silent) -> LiveLatencies:
         )
         window_ms = window_times_ms(cut.windows, model)
         progress("live", 4, n_stages)
-        channels = sent_channels(log)
+        channels = serving.sent_channels(log)
         begun_s = perf_counter()
-        with service_process(["--model", uri, "--robot", ROBOT]) as service:
-            each = _within(packed(list(messages_of(log, 100.0, 100.0))), settings.seconds)
-            asyncio.run(drive(service.socket_url, hello("first", channels), each[:3]))
+        with serving.service_process(["--model", uri, "--robot", ROBOT]) as service:
+            each = _within(packed(list(serving.messages_of(log, 100.0, 100.0))), settings.seconds)
+            asyncio.run(serving.drive(service.socket_url, serving.hello("first", channels), each[:3]))
             start_s, rss_mb = perf_counter() - begun_s, service.rss_mb
-            one = asyncio.run(drive(service.socket_url, hello("one", channels), each))
+            one = asyncio.run(serving.drive(service.socket_url, serving.hello("one", channels), each))
             progress("live", 5, n_stages)
-            messages = _within(packed(list(messages_of(log))), settings.seconds)
+            messages = _within(packed(list(serving.messages_of(log))), settings.seconds)
             by_sessions = []
             for stage, share in enumerate(SHARES):
                 n = max(math.ceil(share * settings.robots), 1)
                 before = service.figure("terrain_rows_total")
-                driven = asyncio.run(drive_all(service.socket_url, channels, messages, n))
+                driven = asyncio.run(serving.drive_all(service.socket_url, channels, messages, n))
                 taken = service.figure("terrain_rows_total") - before
                 times = spread([ms for found in driven for ms in found.times_ms])
                 lost = sum(found.rows for found in driven) - int(taken)

@@ -26,7 +26,7 @@ ROBOT = load_robot("agrimaro")
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_every_study_is_one_file_like_a_command(name):
-    module = import_module(STUDIES[name][0])
+    module = import_module(f"studies.{name.replace('-', '_')}")
     assert module.EXAMPLE.startswith(f"python tests/studies {name}")
     assert isinstance(module.Settings, type)
     assert callable(module.run)
