@@ -209,7 +209,7 @@ def _driven(run: RunLog, robot: Robot) -> tuple[Array, Array, Array]:
     grade = -imu.channel("pitch_rad") if imu is not None and "pitch_rad" in imu.channels else none
     if wheels is None or not set(robot.rate_channels) <= set(wheels.channels):
         return none, none, grade
-    rates = np.column_stack([wheels.channel(name) for name in robot.rate_channels])
+    rates = wheels.columns(robot.rate_channels)
     if robot.rate_channels[0].startswith("motor_"):
         rates = rates * (robot.wheel_radius_m / robot.motors.reduction_ratio)
     directions, speed = robot.wheel_directions_rad, rates.mean(axis=1)

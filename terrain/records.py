@@ -7,7 +7,7 @@ function given a record may trust it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from operator import attrgetter
@@ -83,6 +83,10 @@ class Stream:
             return self.values[:, self.channels.index(name)]
         except ValueError:
             raise KeyError(name) from None
+
+    def columns(self, names: Iterable[str]) -> Array:
+        """Return the values (n, k) of some channels; ``KeyError`` when the stream lacks one."""
+        return np.column_stack([self.channel(name) for name in names])
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a column a channel, by time in s."""

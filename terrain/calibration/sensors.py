@@ -342,7 +342,7 @@ def sensor_noise(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
         for stretch, by_camera in zip(stretches, seen, strict=True):
             signal = stretch.of(stream, channels)
             if not stream and by_camera is not None:
-                columns = np.column_stack([by_camera.channel(name) for name in channels])
+                columns = by_camera.columns(channels)
                 signal = Stream(by_camera.time_s, columns, tuple(channels))
             elif signal is not None and parameter.endswith("_rad"):
                 turned = np.column_stack([unwrapped(column) for column in signal.values.T])

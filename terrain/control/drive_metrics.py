@@ -113,9 +113,9 @@ def drive_history(
     """
     truth, wheels, commands = run.streams["truth"], robot.wheels, run.streams.get("commands")
     time_s, step_s = truth.time_s, float(np.median(np.diff(truth.time_s)))
-    twist = np.column_stack([truth.channel(name) for name in TWIST])
+    twist = truth.columns(TWIST)
     rate, steer, torque, traction, side, sinkage = (
-        np.column_stack([truth.channel(name.format(wheel)) for wheel in wheels])
+        truth.columns(name.format(wheel) for wheel in wheels)
         for name in (
             *("wheel_{}_radps", "steer_{}_rad", "torque_{}_nm"),
             *("traction_{}_n", "side_{}_n", "sinkage_{}_m"),
@@ -243,7 +243,7 @@ def adaptation_times(
 
 def command_change(commands: Stream) -> float:
     """Return the rms rate of change of the wheels' commands in rad/s^2."""
-    wheels = np.column_stack([commands.channel(f"wheel_{i}_radps") for i in (1, 2, 3)])
+    wheels = commands.columns(f"wheel_{i}_radps" for i in (1, 2, 3))
     return float(np.sqrt(np.mean((np.diff(wheels, axis=0) / np.diff(commands.time_s)[:, None]) ** 2)))
 
 

@@ -208,8 +208,8 @@ def traces_of(runs: Sequence[RunLog], robot: Robot) -> tuple[Traces, float]:
     areas, starts, places, measured, news, holds = [none], [none], [np.empty(0)], [none], [none], []
     for run in runs:
         commands, wheels = run.streams["commands"], run.streams["wheels"]
-        rates = np.column_stack([wheels.channel(name) for name in robot.rate_channels]) / per_radps
-        orders = np.column_stack([commands.channel(f"wheel_{wheel}_radps") for wheel in robot.logged_wheels])
+        rates = wheels.columns(robot.rate_channels) / per_radps
+        orders = commands.columns(f"wheel_{wheel}_radps" for wheel in robot.logged_wheels)
         inside = (wheels.time_s >= commands.time_s[0]) & (wheels.time_s <= commands.time_s[-1])
         inside &= np.isfinite(rates).all(axis=1)
         time_s, rates = wheels.time_s[inside], rates[inside]

@@ -217,7 +217,7 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
         )
     is_motor = names[0].startswith("motor")
     scale = robot.wheel_radius_m / robot.motors.reduction_ratio if is_motor else 1.0
-    speeds = np.column_stack([wheels.channel(channel) for channel in names]) * scale
+    speeds = wheels.columns(names) * scale
     # poses of an omni robot's body (of a camera above, motion capture) count where nothing else measures its speed
     pose, lidar = run.streams.get("pose"), run.streams.get("lidar")
     others = "odometry" in run.streams or (lidar is not None and "speed_x_mps" in lidar.channels)
@@ -256,7 +256,7 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
         measured[:, CHANNELS.index(channel)] = _resample(time_s, stamps_s, values)
     names = [f"current_{wheel}_a" for wheel in robot.wheels]
     if set(names) <= set(wheels.channels):
-        currents = np.column_stack([wheels.channel(channel) for channel in names])
+        currents = wheels.columns(names)
         if robot.on_omni_wheels:
             currents = np.abs(currents)
         else:

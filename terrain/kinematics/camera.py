@@ -68,10 +68,10 @@ def body_motion(odometry: Stream, camera: Camera) -> BodyMotion:
     from scipy.spatial.transform import Rotation  # long to import, and no live chain needs it
 
     position, velocity, rate = (
-        to_body(_channels(odometry, f"{quantity}_{{}}_{unit}", "xyz"))
+        to_body(odometry.columns(f"{quantity}_{axis}_{unit}" for axis in "xyz"))
         for quantity, unit in (("position", "m"), ("velocity", "mps"), ("rate", "radps"))
     )
-    quaternion = _channels(odometry, "quaternion_{}_ratio", "xyzw")
+    quaternion = odometry.columns(f"quaternion_{axis}_ratio" for axis in "xyzw")
     valid = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) <= QUATERNION_TOLERANCE
     rotation = np.full((len(odometry), 3, 3), np.nan)
     if valid.any():
@@ -161,7 +161,3 @@ def to_camera(vectors: Array) -> Array:
     """Return vectors (..., 3) given in the body's axes in the camera's."""
     turned: Array = vectors[..., [1, 2, 0]] * [-1.0, 1.0, -1.0]
     return turned
-
-
-def _channels(stream: Stream, name: str, axes: str) -> Array:
-    return np.column_stack([stream.channel(name.format(axis)) for axis in axes])

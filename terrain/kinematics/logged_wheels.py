@@ -73,10 +73,10 @@ def speed_columns(channels: Sequence[str], robot: Robot | None) -> tuple[list[in
 
 def wheel_and_ground_speed(truth: Stream, robot: Robot) -> tuple[Array, Array]:
     """Return the true wheel speed, by the nominal radius, and speed over ground along each wheel, (n, wheels)."""
-    steer = _wheel_columns(truth, robot, "steer_{}_rad")
-    twist = np.column_stack([truth.channel(name) for name in TWIST])
+    steer = truth.columns(f"steer_{wheel}_rad" for wheel in robot.wheels)
+    twist = truth.columns(TWIST)
     along, _ = wheel_frame_velocities(twist, robot.wheel_positions_m, steer)
-    return _wheel_columns(truth, robot, "wheel_{}_radps") * robot.wheel_radius_m, along
+    return truth.columns(f"wheel_{wheel}_radps" for wheel in robot.wheels) * robot.wheel_radius_m, along
 
 
 def true_slip(truth: Stream, wheels: Sequence[str]) -> Array:
@@ -90,8 +90,4 @@ def true_slip(truth: Stream, wheels: Sequence[str]) -> Array:
     for i, wheel in enumerate(wheels):
         if f"slip_{wheel}_ratio" in truth.channels:
             recorded[:, i] = truth.channel(f"slip_{wheel}_ratio")
-    return traction_slip(recorded, np.column_stack([truth.channel(f"wheel_{w}_radps") for w in wheels]))
-
-
-def _wheel_columns(truth: Stream, robot: Robot, pattern: str) -> Array:
-    return np.column_stack([truth.channel(pattern.format(wheel)) for wheel in robot.wheels])
+    return traction_slip(recorded, truth.columns(f"wheel_{w}_radps" for w in wheels))

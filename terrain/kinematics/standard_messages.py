@@ -63,14 +63,14 @@ def _to_imu(stream: Stream) -> Array | None:
     for place in (0, 3):
         channels = IMU_CHANNELS[place : place + 3]
         if set(channels) <= set(stream.channels):
-            numbers[:, place : place + 3] = _columns(stream, channels)
+            numbers[:, place : place + 3] = stream.columns(channels)
         else:
             numbers[:, 10 + place // 3] = UNKNOWN
     if (numbers[:, 10:12] == UNKNOWN).all():
         return None
     known: Array = np.zeros(len(stream), dtype=bool)
     if set(IMU_CHANNELS[6:]) <= set(stream.channels):
-        euler = _columns(stream, IMU_CHANNELS[6:])
+        euler = stream.columns(IMU_CHANNELS[6:])
         known = np.asarray(np.isfinite(euler).all(axis=1))
         if known.any():
             numbers[known, 6:10] = Rotation.from_euler("ZYX", euler[known][:, ::-1]).as_quat()
@@ -92,7 +92,7 @@ def _of_odometry(numbers: Array) -> Converted:
 def _to_odometry(stream: Stream) -> Array | None:
     if not set(_CAMERA) <= set(stream.channels):
         return None
-    values = _columns(stream, _CAMERA)
+    values = stream.columns(_CAMERA)
     position, vector, velocity, rate = (to_body(values[:, a : a + 3]) for a in (0, 3, 7, 10))
     quaternion = np.column_stack([vector, values[:, 6]])
     body = np.full(velocity.shape, np.nan)
@@ -107,7 +107,7 @@ def _of_twist(numbers: Array) -> Converted:
 
 
 def _to_twist(stream: Stream) -> Array | None:
-    return _columns(stream, TWIST) if set(TWIST) <= set(stream.channels) else None
+    return stream.columns(TWIST) if set(TWIST) <= set(stream.channels) else None
 
 
 def _of_pose(numbers: Array) -> Converted:
@@ -127,10 +127,6 @@ def _of_fix(numbers: Array) -> Converted:
     if not np.isfinite(std_m).any():
         return POSITION_CHANNELS, metres
     return (*POSITION_CHANNELS, "std_position_m"), np.column_stack([metres, std_m])
-
-
-def _columns(stream: Stream, channels: tuple[str, ...]) -> Array:
-    return np.column_stack([stream.channel(channel) for channel in channels])
 
 
 def _paths(path: str, axes: str = "xyz") -> tuple[str, ...]:
@@ -212,7 +208,7 @@ def standard_topic(name: str, stream: Stream) -> StandardTopic | None:
         }
         paths = tuple(f"{field}[{i}]" for i in range(len(channels)))
         return StandardTopic(
-            "/joint_states", "sensor_msgs/msg/JointState", paths, _columns(stream, channels), fixed
+            "/joint_states", "sensor_msgs/msg/JointState", paths, stream.columns(channels), fixed
         )
     if name not in _TOPICS:
         return None

@@ -223,7 +223,7 @@ def _gravity(run: RunLog) -> Check:
     stream, names = run.streams.get("imu"), [f"accel_{axis}_mps2" for axis in AXES]
     if stream is None or not set(names) <= set(stream.channels):
         return _unknown("gravity", "imu", "gravity: the run has no accelerometer of three axes")
-    values = np.column_stack([stream.channel(name) for name in names])
+    values = stream.columns(names)
     finite = np.isfinite(values).all(axis=1)
     if finite.sum() < MIN_SAMPLES or np.ptp(stream.time_s[finite]) < MIN_GRAVITY_S:
         return _unknown("gravity", "imu", f"gravity: fewer than {MIN_GRAVITY_S:g} s of the accelerometer")

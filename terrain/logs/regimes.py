@@ -30,11 +30,11 @@ def driven_at(run: RunLog, low_mps: float, high_mps: float) -> bool:
     commands, wheels = run.streams.get("commands"), run.streams.get("wheels")
     if commands is not None and "speed_x_mps" in commands.channels:
         parts = [name for name in ("speed_x_mps", "speed_y_mps") if name in commands.channels]
-        speed = np.linalg.norm(np.column_stack([commands.channel(name) for name in parts]), axis=1)
+        speed = np.linalg.norm(commands.columns(parts), axis=1)
     else:
         names = [] if wheels is None else [name for name in wheels.channels if name.startswith("speed_")]
         if wheels is None or not names:
             return False
-        speed = np.abs(np.column_stack([wheels.channel(name) for name in names])).mean(axis=1)
+        speed = np.abs(wheels.columns(names)).mean(axis=1)
     known = speed[np.isfinite(speed)]
     return bool(known.size and low_mps <= known.mean() <= high_mps)

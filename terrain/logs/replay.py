@@ -100,7 +100,7 @@ def _twists(run: RunLog, ticks: Array) -> Array:
     commands = run.streams.get("commands")
     if commands is None or not set(TWIST) <= set(commands.channels):
         return twists
-    desired = np.column_stack([commands.channel(channel) for channel in TWIST])
+    desired = commands.columns(TWIST)
     last = np.searchsorted(commands.time_s, ticks + _SLACK_S, side="right") - 1
     twists[last >= 0] = desired[last[last >= 0]]
     return twists

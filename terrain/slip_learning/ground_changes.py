@@ -115,7 +115,7 @@ def response_log(run: RunLog, robot: Robot) -> tuple[Array, Array, Array]:
     names = [f"current_{wheel}_a" for wheel in robot.wheels]
     if not set(names) <= set(wheels.channels):
         raise DataError(f"run {run.run_id}: has no current of each wheel ({', '.join(names)})")
-    return time_s, np.column_stack([wheels.channel(name) for name in names]), speeds
+    return time_s, wheels.columns(names), speeds
 
 
 def watch(run: RunLog, robot: Robot, detector: DetectorSettings) -> WatchedRun:

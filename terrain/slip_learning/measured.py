@@ -149,11 +149,7 @@ def travelled(run: RunLog, robot: Robot, delay_s: float = 0.0) -> Travelled:
         )
     stream, by_pose = run.streams[name], name == "pose"
     usual_s = float(np.median(np.diff(stream.time_s)))
-    values = (
-        np.column_stack([stream.channel(channel) for channel in POSE_CHANNELS])
-        if by_pose
-        else _twists(run, robot, name)
-    )
+    values = stream.columns(POSE_CHANNELS) if by_pose else _twists(run, robot, name)
     known = np.isfinite(values).all(axis=1)
     time_s, values = stream.time_s[known], values[known]
     if len(time_s) < 2:
@@ -202,7 +198,7 @@ def _twists(run: RunLog, robot: Robot, name: str) -> Array:
             turn = np.interp(stream.time_s, imu.time_s[known], gyro[known]) if known.any() else still
         return np.column_stack([ahead, still, turn])
     if set(TWIST) <= set(stream.channels):
-        return np.column_stack([stream.channel(channel) for channel in TWIST])
+        return stream.columns(TWIST)
     camera = robot.completed.camera
     if set(CAMERA_CHANNELS[:-1]) <= set(stream.channels):
         seen = body_motion(stream, camera)
@@ -430,7 +426,7 @@ def wheel_speeds(run: RunLog, robot: Robot) -> tuple[Array, Array]:
     wheels = run.streams.get("wheels")
     if wheels is None or not set(names) <= set(wheels.channels) or len(wheels) < 2:
         raise DataError(f"run {run.run_id}: has no wheel speeds ({', '.join(names)}) of two samples or more")
-    return wheels.time_s, np.column_stack([wheels.channel(name) for name in names])
+    return wheels.time_s, wheels.columns(names)
 
 
 def wheel_directions(run: RunLog, robot: Robot, start_s: Array, end_s: Array) -> Array:
@@ -448,7 +444,7 @@ def wheel_directions(run: RunLog, robot: Robot, start_s: Array, end_s: Array) ->
     if steering is None or not set(names) <= set(steering.channels):
         raise DataError(f"run {run.run_id}: has no steering angles ({', '.join(names)})")
     angles = np.zeros((len(steering), len(robot.wheels)))  # those that are not steered point ahead
-    angles[:, : len(names)] = np.column_stack([steering.channel(name) for name in names])
+    angles[:, : len(names)] = steering.columns(names)
     angles -= robot.steering_zeros_rad
     means = np.full((len(start_s), len(robot.wheels)), np.nan)
     for i, (first_s, last_s) in enumerate(zip(start_s, end_s, strict=True)):
@@ -775,7 +771,7 @@ def operating_points(runs: Sequence[RunLog], slips: Sequence[MeasuredSlip], robo
         point[0] = np.median(slip.body_slip[slip.known])
         if not set(names) <= set(wheels.channels):
             continue
-        current = np.abs(np.column_stack([wheels.channel(name) for name in names]))
+        current = np.abs(wheels.columns(names))
         ends = zip(slip.start_s[slip.known], slip.end_s[slip.known], strict=True)
         inside = np.any([(wheels.time_s >= a) & (wheels.time_s <= b) for a, b in ends], axis=0)
         known = np.isfinite(current).all(axis=1) & inside
