@@ -66,18 +66,25 @@ def plain_sums(time_s, value, least, per_second, fate, period_s=None):
     return sums
 
 
+def plain_counts(value):
+    """Count how often each value has repeated itself; one that is unknown does not count."""
+    counts, count, last = np.zeros(value.size), 0, np.nan
+    for k in range(value.size):
+        if np.isfinite(value[k]):
+            count, last = (count + 1 if abs(value[k] - last) <= feed.SAME else 0), value[k]
+        counts[k] = count
+    return counts
+
+
 def plain_frozen(value, most, moving):
     """Mark values that have repeated themselves ``most`` times, or four times their longest run in motion."""
-    frozen = np.zeros(value.size, dtype=bool)
-    count, longest, began, last = 0, 0, False, np.nan
+    frozen, counts = np.zeros(value.size, dtype=bool), plain_counts(value)
+    longest, began, before = 0, False, 0
     for k in np.flatnonzero(np.isfinite(value)):
-        if abs(value[k] - last) <= feed.SAME:
-            count += 1
-        else:
-            longest = max(longest, count) if moving[k] and began else longest
-            count, began = 0, moving[k]
-        last = value[k]
-        frozen[k] = moving[k] and count >= max(most, 4 * longest)
+        if counts[k] == 0:
+            longest = max(longest, before) if moving[k] and began else longest
+            began = moving[k]
+        before, frozen[k] = counts[k], moving[k] and counts[k] >= max(most, 4 * longest)
     return frozen
 
 
@@ -317,17 +324,6 @@ def plain_wheels(clock, motor_radps, rates, robot):
         once, _, _ = plain_moving(clock, kept * robot.wheel_radius_m)
         moving = np.append(False, (np.abs(once[:-1]) > feed.MOVING_MPS).any(axis=1))
     return kept
-
-
-def plain_counts(value):
-    counts, last = np.zeros(value.size), np.nan
-    for k in range(value.size):
-        counts[k] = counts[k - 1] + 1 if abs(value[k] - last) <= feed.SAME else 0
-        if np.isnan(value[k]):
-            counts[k] = counts[k - 1] if k else 0
-        else:
-            last = value[k]
-    return counts
 
 
 def plain_lives(name, stream, moving):

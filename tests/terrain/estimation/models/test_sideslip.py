@@ -1,4 +1,4 @@
-"""Observers of sideslip: the filter in plain numpy, recovery of hidden truth, and sensor faults."""
+"""Observers of sideslip: their equations, recovery of hidden truth, and sensor faults."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import functools
 import numpy as np
 import pytest
 
-from terrain.estimation.models import sideslip
 from terrain.estimation.models.observer import ObserverStatus, observe
-from terrain.estimation.models.sideslip import FIRST_STD, RATE, SETTINGS, Sideslip
+from terrain.estimation.models.sideslip import RATE, SETTINGS, Sideslip
 from terrain.robots import load_robot
 from terrain.simulation.plants.car import CarCommand, CarDrive, level_ground
 from terrain.simulation.run import simulate
@@ -56,110 +55,65 @@ def derivative(function, x):
     return np.column_stack([(function(x + d) - function(x - d)) / (2 * d.sum()) for d in steps])
 
 
-def plain(rows, s):
-    """The filter in plain numpy, for forward motion: dynamics by differences, joint updates, no gates."""
-    x = np.array([*rows[0, 2:5], np.tan(rows[0, 1]), AHEAD / L * np.tan(rows[0, 1]), 1.0, 0.0])
-    axles = np.sqrt([0.5 + 0.5 * sideslip.STIFFNESS_CORRELATION, 0.5 - 0.5 * sideslip.STIFFNESS_CORRELATION])
-    std = [
-        sideslip.POSITION_STD_M,
-        sideslip.POSITION_STD_M,
-        sideslip.YAW_STD_RAD,
-        *FIRST_STD,
-        *(sideslip.STIFFNESS_STD_RATIO * axles),
-    ]
-    cov, out, before = np.diag(np.square(std)), [], rows[0]
-    mixed = np.array([[1.0, 1.0], [1.0, -1.0]])
-    for k, row in enumerate(rows):
-        (u, steer, *_, rate, roll, accel), (u_before, steer_before) = row, before[:2]
-        before = row
-        moves = u >= s.slowest_mps
-        dynamic = s.by_dynamics and moves
-        u_before = u_before if dynamic and u_before >= s.slowest_mps else u
-        excited = dynamic and abs(u * rate + G * np.sin(roll)) > sideslip.EXCITED_MPS2
+def equations(u, steer, roll, u_before, steer_before, by_dynamics):
+    """Return a tick of forward motion, and what is measured, as functions of the state; A by differences."""
 
-        def slips(r, w, u=u, steer=steer):
-            return np.arctan([(w + BEHIND * r) / u, (w - AHEAD * r) / u]) - [steer, 0.0]
+    def slips(r, w):
+        return np.arctan([(w + BEHIND * r) / u, (w - AHEAD * r) / u]) - [steer, 0.0]
 
-        def forces(r, w, c, steer=steer):
-            front, rear = -C_0 * (mixed @ c) * slips(r, w) * [np.cos(steer), 1.0]
-            return np.array(
-                [(BEHIND * front - AHEAD * rear) / ROBOT.yaw_inertia_kgm2, (front + rear) / ROBOT.mass_kg]
-            )
-
-        def motion(x, u=u, steer=steer, roll=roll, dynamic=dynamic, before=(u_before, steer_before)):
-            if not dynamic:
-                slip = np.arctan([x[4] + BEHIND / L * x[3], x[4] - AHEAD / L * x[3]]) - [before[1], 0.0]
-                turn = np.tan(steer + slip[0]) - np.tan(slip[1])
-                return np.array([turn, np.tan(slip[1]) + AHEAD / L * turn])
-            v = before[0] * np.array([1.0 / L, 1.0]) * x[3:5]
-            f = lambda v: forces(*v, x[5:]) - [0.0, u * v[0] + G * np.sin(roll)]  # noqa: E731
-            v = v + np.linalg.solve(np.eye(2) - TICK_S * derivative(f, v), TICK_S * f(v))
-            return v / np.array([u / L, u])
-
-        def move(x, u=u):
-            after = motion(x)
-            turn, side = 0.5 * (x[3:5] + after)
-            yaw, lateral = x[2] + 0.5 * TICK_S * u * turn / L, u * (side - AHEAD / L * turn)
-            step = u * np.exp(1j * yaw) + 1j * lateral * np.exp(1j * yaw)
-            return np.array(
-                [
-                    *(x[:2] + TICK_S * np.array([step.real, step.imag])),
-                    x[2] + TICK_S * u * turn / L,
-                    *after,
-                    *x[5:],
-                ]
-            )
-
-        def measure(x, u=u):
-            turning, force = forces(u / L * x[3], u * x[4], x[5:])
-            return np.array([*x[:3], u / L * x[3], force - AHEAD * turning])
-
-        if k and u >= 0.05:
-            by = derivative(move, x)
-            by[:5, 5:] *= excited
-            by[:3, 3:] *= s.by_fixes
-            walk = np.zeros(7)
-            walk[:3] = np.array([0.01, 0.01, 0.002]) + 0.03 * u * np.array([1.0, 1.0, 1.0 / L]) * (
-                not s.by_fixes
-            )
-            arm = np.hypot(AHEAD, BEHIND) / L
-            walk[3:5] = np.array([np.sqrt(2.0), arm]) * sideslip.SLIP_WALK_RADPS
-            if dynamic:
-                walk[3:5] = sideslip.TURN_WALK_RADPS2 * L / u, sideslip.SIDE_WALK_MPS2 / u
-            walk[5:] = sideslip.STIFFNESS_WALK_RATIO * axles * excited
-            x, cov = move(x), by @ cov @ by.T + TICK_S * np.diag(walk**2)
-        if u >= 0.05:
-            z = np.array([*row[2:5], *([rate, accel] if s.by_imu and moves else [np.nan, np.nan])])
-            by = derivative(measure, x)
-            by[:, 5:] *= excited
-            seen = np.isfinite(z)
-            error = (z - measure(x))[seen]
-            h, r = (
-                by[seen],
-                np.square([0.02, 0.02, 0.005, sideslip.GYRO_STD_RADPS, sideslip.ACCEL_STD_MPS2])[seen],
-            )
-            gain = cov @ h.T @ np.linalg.inv(h @ cov @ h.T + np.diag(r))
-            x, rest = x + gain @ error, np.eye(7) - gain @ h
-            cov = rest @ cov @ rest.T + gain * r @ gain.T
-        out.append(
-            [*slips(u / L * x[3], u * x[4]), x[5] + x[6], np.sqrt(cov[4, 4])]
-            if u > 0.05
-            else np.full(4, np.nan)
+    def forces(r, w, c):
+        front, rear = -C_0 * [c[0] + c[1], c[0] - c[1]] * slips(r, w) * [np.cos(steer), 1.0]
+        return np.array(
+            [(BEHIND * front - AHEAD * rear) / ROBOT.yaw_inertia_kgm2, (front + rear) / ROBOT.mass_kg]
         )
-    return np.array(out)
+
+    def motion(x):
+        if not by_dynamics:
+            slip = np.arctan([x[4] + BEHIND / L * x[3], x[4] - AHEAD / L * x[3]]) - [steer_before, 0.0]
+            turn = np.tan(steer + slip[0]) - np.tan(slip[1])
+            return np.array([turn, np.tan(slip[1]) + AHEAD / L * turn])
+        v = u_before * x[3:5] / [L, 1.0]
+
+        def f(v):
+            return forces(*v, x[5:]) - [0.0, u * v[0] + G * np.sin(roll)]
+
+        v = v + np.linalg.solve(np.eye(2) - TICK_S * derivative(f, v), TICK_S * f(v))
+        return v / [u / L, u]
+
+    def move(x):
+        after = motion(x)
+        turn, side = 0.5 * (x[3:5] + after)
+        step = u * np.exp(1j * (x[2] + 0.5 * TICK_S * u * turn / L)) * (1.0 + 1j * (side - AHEAD / L * turn))
+        moved = TICK_S * np.array([step.real, step.imag, u * turn / L])
+        return np.array([*(x[:3] + moved), *after, *x[5:]])
+
+    def measure(x):
+        turning, force = forces(u / L * x[3], u * x[4], x[5:])
+        return np.array([*x[:3], u / L * x[3], force - AHEAD * turning])
+
+    return move, measure
 
 
 @ANY
-def test_it_is_the_filter_in_plain_numpy(name):
-    time_s, rows, _ = drive(4.0, seed=3, roll_rad=0.1, seconds=6.0)
-    track, expected = observed(name, time_s, rows), plain(rows, SETTINGS[name])
-    moves = slice(200, None)  # where it began is forgotten
-    assert track.slip[moves] == pytest.approx(expected[moves, :2], abs=1e-5)
-    if SETTINGS[name].by_dynamics:
-        assert track.state("cornering_front_npr")[moves] == pytest.approx(
-            C_0[0] * expected[moves, 2], rel=1e-4
-        )
-        assert track.std[moves, 4] == pytest.approx(rows[moves, 0] * expected[moves, 3], rel=1e-3)
+def test_a_tick_is_that_of_the_equations_and_its_derivatives_leave_out_what_is_not_learned(name):
+    model, chosen, rng = Sideslip(ROBOT, name).filter.model, SETTINGS[name], np.random.default_rng(0)
+    for is_excited in (False, True) * 10:
+        u, steer, roll = rng.uniform([1.0, -0.2, -0.2], [6.0, 0.2, 0.2])
+        tick = u, steer, roll, u * rng.uniform(0.95, 1.05), steer + rng.normal(0.0, 0.01), chosen.by_dynamics
+        x = np.concatenate([rng.normal(size=3), rng.normal(0.0, 0.05, 2), rng.normal([1.0, 0.0], 0.1)])
+        params = np.array([*model.params, *tick, is_excited])
+        x_next, f, z, h = np.zeros(7), np.zeros((7, 7)), np.zeros(5), np.zeros((5, 7))
+        model.propagate(x, TICK_S, params, x_next, f)
+        model.observe(x, params, z, h)
+        move, measure = equations(*tick)
+        np.testing.assert_allclose(x_next, move(x), atol=1e-8)
+        np.testing.assert_allclose(z, measure(x), rtol=1e-9, atol=1e-9)
+        by_x, seen = derivative(move, x), derivative(measure, x)
+        by_x[:5, 5:] *= is_excited
+        by_x[:3, 3:] *= chosen.by_fixes
+        seen[:, 5:] *= is_excited
+        np.testing.assert_allclose(f, by_x, atol=1e-4)
+        np.testing.assert_allclose(h, seen, rtol=1e-6, atol=1e-6)
 
 
 @ANY

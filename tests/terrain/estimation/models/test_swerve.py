@@ -10,13 +10,11 @@ from scipy.stats import chi2
 from terrain.errors import ConfigError
 from terrain.estimation.consistency import nees
 from terrain.estimation.estimate import estimate_run
-from terrain.estimation.feed import DERIVED_ROWS, REST_AFTER_S, ROWS, measurement_table
+from terrain.estimation.feed import DERIVED_ROWS, REST_AFTER_S, measurement_table
 from terrain.estimation.filter import GATE_PROBABILITY, HELD_S, REOPEN_AFTER_S, FilterSettings, run_filter
-from terrain.estimation.live import LiveFilter
 from terrain.estimation.models.swerve import FILTERS, THESIS_SAMPLE_TIME_S, make_filter, scheduled
-from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.schema import IMU_CHANNELS
-from terrain.records import GATED, REOPENED, Reading, Stream
+from terrain.records import GATED, REOPENED, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 from terrain.simulation.scenario import Faults
@@ -187,64 +185,35 @@ def test_held_sensors_are_reopened_after_two_seconds_and_others_after_a_fifth():
         assert DT_S * (reopened - first) == pytest.approx(after_s, abs=1.5 * DT_S)
 
 
-def driven(motion_of, duration_s):
-    """Return estimator and estimates of a robot whose wheels' rate and acceleration a function gives.
-
-    The camera gives nothing but in the first two seconds, in which the robot stands; IMU at 100 Hz.
-    """
-    rng, estimator, found = np.random.default_rng(4), LiveFilter(ROBOT), []
-    for k in range(round(duration_s / DT_S)):
-        time_s = k * DT_S
-        wheel_radps, accel_mps2 = motion_of(time_s)
-        imu_s = time_s - DT_S + 0.01 * np.arange(1, 3)
-        imu = np.zeros((2, 9))
-        imu[:, 2] = 0.004 + 0.002 * rng.standard_normal(2)
-        imu[:, 3] = accel_mps2 + 0.05
-        imu[:, 3:6] += 0.03 * rng.standard_normal((2, 3))
-        imu[:, 5] += 9.81
-        imu[:, 6:8] = 1e-4 * rng.standard_normal((2, 2))
-        imu[:, 8] = 0.002 * rng.standard_normal(2)
-        stamp_s = np.array([time_s])
-        currents = 0.05 * rng.standard_normal(3)
-        readings = {
-            "wheels": Reading(stamp_s, np.concatenate([np.full(3, wheel_radps), currents])[None]),
-            "steering": Reading(stamp_s, 1e-4 * rng.standard_normal((1, 3))),
-            "imu": Reading(imu_s, imu),
-        }
-        if time_s < 2.0:
-            seen = np.zeros((1, len(CAMERA_CHANNELS)))
-            seen[0, CAMERA_CHANNELS.index("quaternion_w_ratio")] = 1.0
-            seen[0, -1] = 1.0
-            seen[0, : CAMERA_CHANNELS.index("quaternion_w_ratio")] += 1e-4 * rng.standard_normal(6)
-            first = CAMERA_CHANNELS.index("velocity_x_mps")
-            seen[0, first : first + 6] = 1e-3 * rng.standard_normal(6)
-            readings["odometry"] = Reading(stamp_s, seen)
-        found += estimator.step(readings)
-    return estimator, found
+def changed(run, **streams):
+    """Return the run with streams of other values."""
+    new = {
+        name: Stream(run.streams[name].time_s, v, run.streams[name].channels) for name, v in streams.items()
+    }
+    return replace(run, streams={**run.streams, **new})
 
 
-def test_a_robot_at_rest_keeps_its_position_for_half_a_minute_without_a_camera():
-    estimator, found = driven(lambda time_s: (0.0, 0.0), 30.0)
-    places = [estimator.states.index(state) for state in ("position_x_m", "position_y_m")]
-    moved_m = np.array([estimate.mean[places] for estimate in found])
-    assert np.abs(moved_m).max() < 0.05
-    assert np.abs([found[-1].speed_x_mps, found[-1].speed_y_mps, found[-1].yaw_rate_radps]).max() < 0.01
-    assert not np.isnan(found[-1].rows[[ROWS.index(row) for row in DERIVED_ROWS[-3:]]]).any()
-
-
-def test_locked_wheels_that_slide_are_no_rest():
-    """Decelerated by 0.5 m/s^2, as on ice: the wheels stand from 3 s on, the robot from 5 s on."""
-
-    def sliding(time_s):
-        accel = 0.5 if 2.0 <= time_s < 4.0 else (-0.5 if 4.0 <= time_s < 6.0 else 0.0)
-        return (50.0 * min(max(0.5 * (time_s - 2.0), 0.0), 1.0) if time_s < 4.0 else 0.0), accel
-
-    _, found = driven(sliding, 9.0)
-    time_s = np.array([estimate.time_s for estimate in found])
-    rest = ~np.isnan([estimate.rows[ROWS.index(DERIVED_ROWS[-1])] for estimate in found])
-    assert rest[(time_s > 1.5) & (time_s < 2.0)].all()
-    assert not rest[(time_s > 2.2) & (time_s < 6.0 + 0.8 * REST_AFTER_S)].any()
-    assert rest[time_s > 7.5].all()
+def test_a_robot_at_rest_keeps_its_position_without_a_camera_and_locked_wheels_that_slide_are_no_rest():
+    lost = Faults(camera_lost_s=((2.0, 30.0),), by_chance=False)
+    stands = simulate_run(ROBOT, "grass", "stand", 3, duration_s=30.0, faults=lost)
+    found = estimate_run(stands, ROBOT, "vio15")
+    assert np.abs(found.track.mean[:, :2]).max() < 0.05
+    assert np.abs(found.track.mean[-1, 3:6]).max() < 0.01
+    assert np.isfinite(found.table.columns(DERIVED_ROWS[-3:])[-1]).all()
+    # accelerated by 0.5 m/s^2 from 4 to 6 s, and decelerated, as on ice, to 8 s: on wheels that stand from 6 s on
+    wheels, imu = stands.streams["wheels"], stands.streams["imu"]
+    rolling, force = wheels.values.copy(), imu.values.copy()
+    rolling[:, :3] += (
+        50.0 * np.where(wheels.time_s < 6.0, np.clip(0.5 * (wheels.time_s - 4.0), 0.0, 1.0), 0.0)[:, None]
+    )
+    force[:, IMU_CHANNELS.index("accel_x_mps2")] += 0.5 * np.select(
+        [imu.time_s < 4.0, imu.time_s < 6.0, imu.time_s < 8.0], [0.0, 1.0, -1.0]
+    )
+    table = measurement_table(changed(stands, wheels=rolling, imu=force), ROBOT, causal=True)
+    time_s, rest = table.time_s, np.isfinite(table.columns(DERIVED_ROWS[-1:])[:, 0])
+    assert rest[(time_s > 3.0) & (time_s < 4.0)].all()
+    assert not rest[(time_s > 4.2) & (time_s < 8.0 + 0.8 * REST_AFTER_S)].any()
+    assert rest[time_s > 9.5].all()
 
 
 def test_the_offset_of_the_imus_yaw_follows_its_drift_and_the_yaw_stays():
@@ -255,8 +224,7 @@ def test_the_offset_of_the_imus_yaw_follows_its_drift_and_the_yaw_stays():
     def estimated(drift_radps):
         values = imu.values.copy()
         values[:, yaw_channel] += drift_radps * imu.time_s
-        log = replace(run, streams={**run.streams, "imu": Stream(imu.time_s, values, imu.channels)})
-        return estimate_run(log, ROBOT, "vio15").track
+        return estimate_run(changed(run, imu=values), ROBOT, "vio15").track
 
     drifted, plain = estimated(2e-3), estimated(0.0)
     offset, yaw = (drifted.state(name) - plain.state(name) for name in ("imu_yaw_offset_rad", "yaw_rad"))
