@@ -34,50 +34,42 @@ def fly(x, dt, params, x_next, f):
 
 @njit
 def see(x, params, z_hat, h):
-    """A beacon's range, squared, and bearing; speed and turn of the wheels."""
+    """A beacon's range, squared, and bearing; speed and turn of the wheels; a fix along x."""
     east, north = params[0] - x[0], params[1] - x[1]
     square = east**2 + north**2
-    z_hat[0] = square
+    z_hat[0], z_hat[1], z_hat[2] = square, np.arctan2(north, east) - x[2], x[3]
+    z_hat[3], z_hat[4] = x[3] * x[4], x[0]
     h[0, 0], h[0, 1] = -2 * east, -2 * north
-    z_hat[1] = np.arctan2(north, east) - x[2]
     h[1, 0], h[1, 1], h[1, 2] = north / square, -east / square, -1.0
-    z_hat[2] = x[3]
-    h[2, 3] = 1.0
-    z_hat[3] = x[3] * x[4]
+    h[2, 3] = h[4, 0] = 1.0
     h[3, 3], h[3, 4] = x[4], x[3]
-    z_hat[4] = x[0]
-    h[4, 0] = 1.0
 
 
 WALK = np.diag([1e-3, 1e-3, 1e-2, 0.05, 0.1]) ** 2
 WALK[3, 4] = WALK[4, 3] = 0.5 * 0.05 * 0.1
 
 
-def flight():
-    return FilterModel(
-        name="flight",
-        states=("position_x_m", "position_y_m", "yaw_rad", "speed_mps", "yaw_rate_radps"),
-        rows=("square_m", "bearing_rad", "speed_mps", "accel_mps2", "position_x_m"),
-        sensors=(
-            ("beacon", ("square_m", "bearing_rad")),
-            ("wheels", ("accel_mps2", "speed_mps")),
-            ("fix", ("position_x_m",)),
-        ),
-        propagate=fly,
-        observe=see,
-        params=np.array([30.0, 10.0]),
-        process_variance=WALK,
-        measurement_variance=np.square([0.5, 0.01, 0.05, 0.05, 0.1]),
-        initial_variance=np.square([0.5, 0.5, 0.1, 0.3, 0.2]),
-        initial_mean=np.array([0.0, 0.0, 0.0, 1.0, 0.0]),
-        references=("fix",),
-        positions=("position_x_m", "position_y_m"),
-        angle_states=("yaw_rad",),
-        angle_rows=("bearing_rad",),
-    )
-
-
-FLIGHT = flight()
+FLIGHT = FilterModel(
+    name="flight",
+    states=("position_x_m", "position_y_m", "yaw_rad", "speed_mps", "yaw_rate_radps"),
+    rows=("square_m", "bearing_rad", "speed_mps", "accel_mps2", "position_x_m"),
+    sensors=(
+        ("beacon", ("square_m", "bearing_rad")),
+        ("wheels", ("accel_mps2", "speed_mps")),
+        ("fix", ("position_x_m",)),
+    ),
+    propagate=fly,
+    observe=see,
+    params=np.array([30.0, 10.0]),
+    process_variance=WALK,
+    measurement_variance=np.square([0.5, 0.01, 0.05, 0.05, 0.1]),
+    initial_variance=np.square([0.5, 0.5, 0.1, 0.3, 0.2]),
+    initial_mean=np.array([0.0, 0.0, 0.0, 1.0, 0.0]),
+    references=("fix",),
+    positions=("position_x_m", "position_y_m"),
+    angle_states=("yaw_rad",),
+    angle_rows=("bearing_rad",),
+)
 
 
 @pytest.fixture(scope="module")
