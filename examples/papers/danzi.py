@@ -588,10 +588,11 @@ def start_transients(trial: Trial) -> Finding:
     """
     robot, runs = load_robot(ROBOT), seeded_runs(trial, "tiles", "straight", duration_s=6.0)
     lag_s = robot.sensors.encoder_time_constant_s
+    unsmoothed = robot.with_parts(camera=replace(robot.camera, time_constant_s=0.0))  # gets all of the lag
     curves = {
-        "raw": [_slip_with(run, robot, time_constant_s=0.0) for run in runs],
-        "printed": [_slip_with(run, robot, ema_alpha=THESIS_EMA_ALPHA) for run in runs],
-        "matched": [_slip_with(run, robot, time_constant_s=lag_s) for run in runs],
+        "raw": [_slip_with(run, robot, 0.0) for run in runs],
+        "printed": [_slip_with(run, robot, THESIS_EMA_ALPHA) for run in runs],
+        "matched": [_slip_with(run, unsmoothed) for run in runs],
         "truth": [lagged_truth(run, robot) for run in runs],
     }
     dips = {form: [extreme_in_start(curve, np.min) for curve in row] for form, row in curves.items()}
@@ -608,11 +609,9 @@ def start_transients(trial: Trial) -> Finding:
     return Finding(numbers, {"dip": time_figure("Slip in a start at 1 m/s² on tiles", lines)})
 
 
-def _slip_with(
-    run: RunLog, robot: Robot, time_constant_s: float | None = None, ema_alpha: float | None = None
-) -> Curve:
-    """Return the slip by the thesis' filter, without gating, from signals with this smoothing."""
-    table = measurement_table(run, robot, time_constant_s=time_constant_s, ema_alpha=ema_alpha)
+def _slip_with(run: RunLog, robot: Robot, ema_alpha: float | None = None) -> Curve:
+    """Return the slip by the thesis' filter, without gating, from signals with this smoothing, or the encoders' lag."""
+    table = measurement_table(run, robot, ema_alpha=ema_alpha)
     model = make_filter("vio12", robot, thesis=True)
     ungated = FilterSettings(gate_probability=1.0)
     track = run_filter(model, table.time_s, table.columns(model.rows), ungated)

@@ -86,7 +86,6 @@ def estimate_run(
     name: str,
     *,
     tuning: str | None = None,
-    initial_yaw_rad: float | None = None,
     process_variance: Array | None = None,
     model: FilterModel | None = None,
 ) -> Estimate:
@@ -97,14 +96,13 @@ def estimate_run(
     run, robot : log of the robot, as measured, and its description; or both corrected
     name : one of :data:`FILTERS`
     tuning : one of :data:`TUNINGS`; the filter's own (:data:`OWN_TUNING`) by default
-    initial_yaw_rad : heading at the start in the frame of the GNSS, east 0; found from the drive by default,
-        and where the drive does not determine it the GNSS is left out and counted
     process_variance : that of a tuning on chosen runs, which may have other sensors, in place of the physical
     model : with noise of its own, in place of the filter of that name
 
     Returns
     -------
-    of the corrected robot, beside the run as measured, less the GNSS that was left out
+    of the corrected robot, beside the run as measured.  The heading at the start in the frame of the GNSS, east 0, is
+    found from the drive; where that does not determine it the GNSS is left out and counted
 
     Raises
     ------
@@ -119,18 +117,15 @@ def estimate_run(
     model = model or model_of(log, driven, name, tuning)
     if process_variance is not None:
         model = replace(model, process_variance=process_variance)
-    has_gnss, yaw_rad = GNSS_ROWS[0] in model.rows, initial_yaw_rad or 0.0
     ema_alpha = THESIS_EMA_ALPHA if tuning == "thesis" and name == "vio12" else None
-    table = measurement_table(log, driven, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
-    if has_gnss and initial_yaw_rad is None:
+    table, yaw_rad = measurement_table(log, driven, ema_alpha=ema_alpha), 0.0
+    if GNSS_ROWS[0] in model.rows:
         yaw_rad = gnss_heading(table, driven)
         if math.isnan(yaw_rad):
             streams = dict(run.streams)
             unused = {"gnss: heading not observable in this run": len(streams.pop("gnss"))}
             without = replace(run, streams=streams)
-            found = estimate_run(
-                without, robot, name, tuning=tuning, initial_yaw_rad=0.0, process_variance=process_variance
-            )
+            found = estimate_run(without, robot, name, tuning=tuning, process_variance=process_variance)
             return replace(found, table=replace(found.table, dropped={**found.table.dropped, **unused}))
         table = measurement_table(log, driven, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
     samples = swerve.scheduled(model, table.z, table.gnss_variance, is_physical)

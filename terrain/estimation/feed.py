@@ -269,8 +269,7 @@ def feed_settings(
     robot: Robot,
     period_s: Mapping[str, float],
     initial_yaw_rad: float,
-    gnss_latency_s: float,
-    time_constant_s: float | None = None,
+    ema_alpha: float | None = None,
     **options: Any,
 ) -> Array:
     """Return what is constant of a robot's feed, with neutral values for what it does not have.
@@ -279,17 +278,15 @@ def feed_settings(
     ----------
     period_s : of the wheels, and of each stream that comes
     initial_yaw_rad : heading of the start
-    gnss_latency_s : age of a position when it arrives
-    time_constant_s : of the low-pass on all but the wheels; by default what each sensor lacks to the encoders'
+    ema_alpha : of the thesis' smoothing in place of the low-pass, that all but the wheels lack to the encoders
     options : other fields of :data:`SETTINGS`
     """
-    for name, value in (("time_constant_s", time_constant_s), ("gnss_latency_s", gnss_latency_s)):
-        if value is not None and not 0 <= value < np.inf:
-            raise ConfigError(f"{name} is {value:g}, a time from zero up is required")
+    if ema_alpha is not None and not 0 <= ema_alpha < 1:
+        raise ConfigError(f"ema_alpha is {ema_alpha:g}, a number from 0 to below 1 is required")
     motors, sensors, camera = robot.completed.motors, robot.completed.sensors, robot.completed.camera
     settings = filled(
         SETTINGS,
-        latency_s=[0.0, sensors.imu_latency_s, camera.latency_s, gnss_latency_s],
+        latency_s=[0.0, sensors.imu_latency_s, camera.latency_s, GNSS_LATENCY_S],
         is_steered=robot.steered,
         reduction_ratio=motors.reduction_ratio,
         fastest_radps=MAX_RATE_FACTOR * motors.speed_max_radps,
@@ -303,14 +300,15 @@ def feed_settings(
             sensors.accel_scale_y_ratio,
             sensors.accel_scale_z_ratio,
         ),
+        ema_alpha=ema_alpha or 0.0,
         **options,
     )
-    lag_s = robot.encoder_lag_s if time_constant_s is None else time_constant_s
+    lag_s = robot.encoder_lag_s if ema_alpha is None else 0.0
     for k, (name, signal) in enumerate(SIGNALS.items()):
         limits = lag_s, period_s.get(signal.stream, math.nan), period_s["wheels"]
         if k >= TILT:
             limits = 0.0, 0.02, 0.0
-        elif signal.stream == "odometry" and robot.describes("camera") and time_constant_s is None:
+        elif signal.stream == "odometry" and robot.describes("camera"):
             limits = max(lag_s - camera.time_constant_s, 0.0), *limits[1:]
         judged = robot.steered or k >= TILT or name == "gyro_z_radps"
         settings["limits"][0, k] = _limit(*limits, signal if judged else Signal(signal.stream))
@@ -795,10 +793,8 @@ def measurement_table(
     run: RunLog,
     robot: Robot,
     *,
-    time_constant_s: float | None = None,
     ema_alpha: float | None = None,
     initial_yaw_rad: float = 0.0,
-    gnss_latency_s: float = GNSS_LATENCY_S,
     causal: bool = False,
 ) -> MeasurementTable:
     """Return the measurements of a run, ready for a filter.
@@ -808,12 +804,11 @@ def measurement_table(
     run : with the stream ``wheels``; ``steering``, ``imu``, ``odometry`` and ``gnss`` are optional, whole or
         in parts, and give NaN where they are missing
     robot : a swerve robot needs its motors, steering and sensors described, and its camera with odometry
-    time_constant_s : of the low-pass on all but the wheels; 0 for none.  By default what each sensor lacks to
-        the encoders' ``encoder_time_constant_s`` ((6.12) and (7.8) with a time constant for their alpha)
-    ema_alpha : for the thesis' own smoothing in place of the low-pass: ``z = a z_prev + (1 - a) z_raw`` a
-        tick on the camera's rows (7.8), at 0.2 a delay of a quarter of a tick; the other rows stay raw
+    ema_alpha : for the thesis' own smoothing in place of the low-pass, which is what each sensor lacks to the encoders'
+        ``encoder_time_constant_s`` ((6.12) and (7.8) with a time constant for their alpha):
+        ``z = a z_prev + (1 - a) z_raw`` a tick on the camera's rows (7.8), at 0.2 a delay of a quarter of a tick; the
+        other rows stay raw
     initial_yaw_rad : heading of the start in the world frame, to which all yaw rows are referred
-    gnss_latency_s : age of a position when it arrives
     causal : whether a tick takes only what had arrived by then, as a live filter has to; cleaning looks ahead
         all the same
 
@@ -822,7 +817,7 @@ def measurement_table(
     DataError
         if there are no wheels to give the clock.
     ConfigError
-        if a time constant or an alpha is out of range, or a section of the description is missing.
+        if an alpha is out of range, or a section of the description is missing.
 
     Notes
     -----
@@ -834,12 +829,6 @@ def measurement_table(
 
     A simulated camera or IMU without noise looks frozen where nothing changes: give it noise.
     """
-    if ema_alpha is not None:
-        if not 0 <= ema_alpha < 1:
-            raise ConfigError(f"ema_alpha is {ema_alpha:g}, a number from 0 to below 1 is required")
-        if time_constant_s is not None:
-            raise ConfigError("give time_constant_s or ema_alpha, not both: one of them smooths the camera")
-        time_constant_s = 0.0
     if robot.steered:
         robot.require("motors", "steering", "sensors", *(["camera"] if "odometry" in run.streams else []))
     streams, dropped = clean_streams(run, robot)
@@ -852,8 +841,7 @@ def measurement_table(
         samples.append(np.array(stream.values))
         are_whole.append(np.ones(len(stream), np.bool_))
     came = tuple(stamps), tuple(samples), tuple(are_whole)
-    options = {"is_causal": causal, "ema_alpha": ema_alpha or 0.0}
-    settings = feed_settings(robot, period_s, initial_yaw_rad, gnss_latency_s, time_constant_s, **options)
+    settings = feed_settings(robot, period_s, initial_yaw_rad, ema_alpha, is_causal=causal)
     feed, rows = new_feed(), np.empty((clock.size, N_NUMBERS))
     if not causal:  # the origin, and over the whole log once before, the averages of the yaw at the start
         if len(samples[GNSS]):

@@ -332,7 +332,6 @@ class LiveFilter(Live):
     filter_name : one of :data:`~terrain.estimation.estimate.FILTERS` that is the robot's
     channels : names of the columns of the streams that are read, in their order; those of the schema
     initial_yaw_rad : heading of the start in the world; without it the GNSS is not used
-    gnss_latency_s : age of a position when it arrives
     rate_hz : of ``wheels`` and ``imu``, where they are not those of the robot's description
     correction : of :func:`terrain.extension.correct_live`
 
@@ -366,7 +365,6 @@ class LiveFilter(Live):
         channels: Mapping[str, tuple[str, ...]] | None = None,
         *,
         initial_yaw_rad: float | None = None,
-        gnss_latency_s: float = feed.GNSS_LATENCY_S,
         rate_hz: Mapping[str, float] | None = None,
         correction: Correction | None = None,
     ) -> None:
@@ -395,8 +393,7 @@ class LiveFilter(Live):
         }
         rates |= {"steering": sensors.steering_rate_hz, "odometry": camera.rate_hz, **(rate_hz or {})}
         period_s = {stream: 1.0 / rate for stream, rate in rates.items() if rate > 0.0}
-        arriving = {"is_causal": True, "is_live": True}
-        self._settings = feed.feed_settings(robot, period_s, yaw_rad, gnss_latency_s, **arriving)
+        self._settings = feed.feed_settings(robot, period_s, yaw_rad, is_causal=True, is_live=True)
         self._feed, self._rows = feed.new_feed(), np.full((1, feed.N_NUMBERS), np.nan)
         self._monitor = None if self._skids else HealthMonitor(robot, self.model)
         self._slip, self._region = WheelSlip(robot, self.states), RegionMonitor(robot)

@@ -360,7 +360,6 @@ def test_what_does_not_fit_is_refused():
     )
     for robot, name, options, message in (
         (ROBOT, "vio15", {"channels": {"wheels": ("current_1_a",)}}, "'motor_1_radps' must be among them"),
-        (ROBOT, "vio15", {"gnss_latency_s": -1.0}, "gnss_latency_s is -1"),
         (ROBOT, "vio15", {"initial_yaw_rad": np.nan}, "initial_yaw_rad is nan"),
         (HUSKY, "vio15", {}, "skid_steer"),
         (ROBOT, "skid", {}, "robot agrimaro has the drive 'swerve': this filter is for 'skid_steer'"),
