@@ -206,7 +206,7 @@ FIRST_SIGNAL, VIBRATION, GROWTH, CHANGE, SEEN_AGE, REST_TWIST, SIDE, REST_GYRO =
         *("rest_speed_x_mps", "wheel_left_mps", REST_ROW),
     ),
 )
-_GYRO, _YAW, _SEEN, _SEEN_YAW = (FIRST_SIGNAL + k for k in (GYRO, IMU_YAW, SEEN, SEEN_YAW))
+_GYRO, _YAW, _SEEN, _SEEN_YAW = (FIRST_SIGNAL + np.array([GYRO, IMU_YAW, SEEN, SEEN_YAW])).tolist()
 _POSITION, _VARIANCE = FIRST_SIGNAL + POSITION, len(ROWS)
 #: First and last signal of each stream.
 _SPANS = np.array([[STEER, SEEN], [ACCEL, STEER], [SEEN, POSITION], [POSITION, TILT]])

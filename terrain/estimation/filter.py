@@ -618,7 +618,7 @@ class Filter:
         for name, signature in _SIGNATURES.items():  # compiled with it: finding them costs more than a step
             function = getattr(model, name).overloads[tuple(signature.args)]
             self._kernel += (CompileResultWAP(function),)
-        self._sample = _Samples(np.empty(1), *(np.zeros((1, size)) for size in (m, m, d, n_inputs)))
+        self._sample = _Samples(np.empty(1), *map(np.zeros, ((1, m), (1, m), (1, d), (1, n_inputs))))
         self._nothing = self._columns(1, keep=False)
         self._compiled: Callable[..., None] | None = None
 
