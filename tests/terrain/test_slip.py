@@ -190,7 +190,7 @@ def raw_slip(run, robot, **options):
 def test_a_start_has_no_false_braking_once_the_delays_match(camera_s):
     robot = ROBOT.with_parts(camera=replace(ROBOT.camera, time_constant_s=camera_s))
     run = start_of_a_run(0.125, camera_s)
-    apart, matched = raw_slip(run, robot, time_constant_s=0.0), raw_slip(run, robot)
+    apart, matched = raw_slip(run, robot, ema_alpha=0.0), raw_slip(run, robot)
     assert np.nanmin(apart) < -0.05
     assert np.nanmin(matched) > -0.01
     assert np.nanmin(raw_slip(run, robot, ema_alpha=0.2)) < -0.05  # a quarter of a tick is no 50 ms
