@@ -28,7 +28,7 @@ from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import to_camera
 from terrain.kinematics.wheels import point_velocity
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
-from terrain.records import Array, Reading, Stream
+from terrain.records import Array, Reading, Stream, read_only
 from terrain.robots import Robot, Sensors
 from terrain.simulation.scenario import Faults
 
@@ -122,6 +122,10 @@ class Sensor:
     signals : writes signals (m, c) of the motion's rows from a first one on; none by default
     lags_s : (c,) time constants of their low-passes, which start at rest at the first values
     ahead : rows beyond its own that a signal needs
+
+    Attributes
+    ----------
+    stamp_s : (n,) by its logger's clock, by default when its samples arrive
     """
 
     def __init__(
@@ -134,23 +138,16 @@ class Sensor:
         lags_s: Sequence[float] = (),
         ahead: int = 0,
     ) -> None:
-        self.motion, self.channels, (self.time_s, self.rows) = motion, channels, stamps
+        self.motion, self.channels, self.time_s, self.rows = motion, channels, read_only(stamps[0]), stamps[1]
         self.values = np.empty((len(self.time_s), len(channels)))
         self._write, self._signals, self._ahead = write, signals, ahead
         self._keep = np.array([math.exp(-STEP_S / tau) if tau > 0.0 else 0.0 for tau in lags_s])
         self._start, self._state = np.empty(0), np.zeros(len(self._keep))
         self._first, self._seen = 0, np.empty((0, 0))
         self._n_written = self._n_given = 0
-        self.stamp("", {})
-
-    def stamp(self, stream: str, effects: Mapping[str, float]) -> None:
-        """Stamp as effects have it; samples arrive when they did."""
-        time_s = (
-            on_samples(stream, (), effects)(self.time_s.copy(), self.values)[0] if stream else self.time_s
-        )
-        self._logged = (time_s.view(), self.values.view())
-        for array in self._logged:
-            array.flags.writeable = False
+        self._shown = self.values.view()
+        self._shown.flags.writeable = False
+        self.stamp_s = self.time_s
 
     def update(self) -> None:
         """Write the samples of all rows of the motion that are written."""
@@ -174,11 +171,11 @@ class Sensor:
         """Return the samples that arrived since the last call, up to and with ``time_s``; None for none."""
         new = slice(self._n_given, int(self.time_s.searchsorted(time_s, side="right")))
         self._n_given = new.stop
-        return Reading(*(array[new] for array in self._logged)) if new.start < new.stop else None
+        return Reading(self.stamp_s[new], self._shown[new]) if new.start < new.stop else None
 
     def stream(self) -> Stream:
         """Return all samples, once the motion is complete."""
-        return Stream(*self._logged, self.channels)
+        return Stream(self.stamp_s, self._shown, self.channels)
 
 
 @njit

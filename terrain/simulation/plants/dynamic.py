@@ -81,14 +81,14 @@ import numpy as np
 from scipy.signal import lfilter
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects import EFFECTS, Stage, checked_effects, in_plant, parameters_of, vector_of
+from terrain.effects import EFFECTS, Stage, checked_effects, in_plant, on_samples, parameters_of, vector_of
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.extension import apply_homes
 from terrain.kernels import filled, inner, is_finite, njit, numbers, record
 from terrain.kinematics.commands import wheel_motion
 from terrain.kinematics.wheels import point_velocity
 from terrain.logs.schema import unit_of
-from terrain.records import Array, Command, Label, Sample, Stream
+from terrain.records import Array, Command, Label, Sample, Stream, read_only
 from terrain.robots import Robot, SwerveRobot, as_drive
 from terrain.simulation import sensors as sensing
 from terrain.simulation.scenario import Conditions, Faults, Scenario
@@ -684,7 +684,8 @@ def run_dynamic(
     if gnss is not None:
         sensors["gnss"] = sensing.gnss_sensor(motion, gnss, rngs["gnss"])
     for name, sensor in sensors.items():
-        sensor.stamp(name, built.effects)
+        stamped = on_samples(name, (), built.effects)(sensor.time_s.copy(), sensor.values)
+        sensor.stamp_s = read_only(stamped[0])
 
     status: list[Mapping[str, float]] = []
     if controller is None:
