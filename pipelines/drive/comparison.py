@@ -36,7 +36,6 @@ from terrain.control.drive_metrics import (
     ABSOLUTE,
     LABELS,
     Comparison,
-    Difference,
     Drive,
     MeanInterval,
     Metrics,
@@ -321,7 +320,7 @@ def verdict(result: DriveResult, pairs: Sequence[tuple[str, str]]) -> str:
         found = compared.difference(name, other, key)
         if found is None:
             continue
-        if math.isnan(found.low) or found.is_significant:
+        if found.ci is None or found.is_significant:
             significant.append(f"{metric_label(key)[0]} {format_value(found.mean, *_signed(key))}")
         else:
             alike.append(metric_label(key)[0])
@@ -373,13 +372,13 @@ def _difference_parts(compared: Comparison, pairs: Sequence[tuple[str, str]]) ->
     return [Table(("", *(metric_label(key)[0] for key in keys)), rows, note=note)] if keys else []
 
 
-def _difference_text(found: Difference | None, key: str) -> str:
+def _difference_text(found: MeanInterval | None, key: str) -> str:
     if found is None:
         return NOT_KNOWN
     mean = format_value(found.mean, *_signed(key))
-    if math.isnan(found.low):
+    if found.ci is None:
         return mean
-    return f"{mean} ({format_value((found.low, found.high), *_signed(key))}){' *' if found.is_significant else ''}"
+    return f"{mean} ({format_value(found.ci, *_signed(key))}){' *' if found.is_significant else ''}"
 
 
 def _signed(key: str) -> tuple[str, str]:

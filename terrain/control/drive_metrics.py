@@ -345,21 +345,13 @@ class MeanInterval(NamedTuple):
     ci: tuple[float, float] | None
     n: int
 
-
-UNKNOWN = MeanInterval(None, None, 0)
-
-
-class Difference(NamedTuple):
-    """Mean difference and its 95 % interval, which is NaN where one pair gives none."""
-
-    mean: float
-    low: float
-    high: float
-
     @property
     def is_significant(self) -> bool:
-        """Whether the interval excludes zero."""
-        return self.low > 0.0 or self.high < 0.0
+        """Whether there is an interval, and it excludes zero."""
+        return self.ci is not None and (self.ci[0] > 0.0 or self.ci[1] < 0.0)
+
+
+UNKNOWN = MeanInterval(None, None, 0)
 
 
 def mean_interval(values: Sequence[float]) -> MeanInterval:
@@ -497,7 +489,7 @@ class Comparison:
             return UNKNOWN
         return self.means[name].get(key, UNKNOWN)
 
-    def difference(self, name: str, other: str, key: str) -> Difference | None:
+    def difference(self, name: str, other: str, key: str) -> MeanInterval | None:
         """Return the mean difference of a metric between two controllers, seed by seed; None where one has none.
 
         Only seeds at which both are known count; but for :data:`ABSOLUTE` metrics it is relative to the mean of the
@@ -510,9 +502,7 @@ class Comparison:
         scale = 1.0 if key in ABSOLUTE or not len(pairs) else float(pairs[:, 1].mean())
         if not len(pairs) or scale <= 0.0:
             return None
-        mean, ci, _ = mean_interval((pairs[:, 0] - pairs[:, 1]) / scale)
-        assert mean is not None
-        return Difference(mean, *(ci or (math.nan, math.nan)))
+        return mean_interval((pairs[:, 0] - pairs[:, 1]) / scale)
 
     def is_hardly_believed(self, name: str) -> bool:
         """Return whether a controller uses a classifier that was never or hardly believed.

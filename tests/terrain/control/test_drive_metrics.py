@@ -169,7 +169,7 @@ def test_a_difference_is_taken_seed_by_seed():
     assert found.mean == pytest.approx(-0.08)
     assert found.is_significant
     half = 3.182 * gain.std(ddof=1) / 2  # Student's with three degrees of freedom
-    assert found.high - found.low == pytest.approx(2 * half / plain.mean(), rel=1e-3)
+    assert found.ci[1] - found.ci[0] == pytest.approx(2 * half / plain.mean(), rel=1e-3)
     without = plain + gain + [math.nan, 0.0, 0.0, 0.0]
     found = compared(plain=("slip_peak", plain), fallback=("slip_peak", without))
     assert found.difference("fallback", "plain", "slip_peak").mean == pytest.approx(gain[1:].mean() / 3.0)
