@@ -6,6 +6,7 @@ import pytest
 
 from terrain.calibration.omni import COM_X, COM_Y, FRICTION, RADIUS, identify_omni, motor_friction
 from terrain.kinematics.logged_wheels import with_wheel_speeds
+from terrain.logs.robotino import find_runs
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.plants.planar import Ground, spread_numbers
@@ -34,17 +35,8 @@ def drives(n=18, ratio=0.5, terrain="carpet"):
         angle, twist = 2 * np.pi * i / n, np.zeros((201, 3))
         twist[25:] = 0.2 * np.cos(angle), 0.2 * np.sin(angle), 0.0
         ground = Ground(slip_ratio=1.5, rolling_ratio=0.0, roller_ratio=ratio / 1.5)
-        effects = {"wheel_radius_ratio": -0.06}
-        run = simulate(
-            HIDDEN,
-            twist,
-            ground,
-            i,
-            effects=effects,
-            noise=spread_numbers("noise"),
-            run_id=f"{terrain}_{i}",
-            terrain=terrain,
-        )
+        options = {"effects": {"wheel_radius_ratio": -0.06}, "noise": spread_numbers("noise")}
+        run = simulate(HIDDEN, twist, ground, i, run_id=f"{terrain}_{i}", terrain=terrain, **options)
         runs.append(with_wheel_speeds(run, ROBOT))
     return runs
 
@@ -61,12 +53,8 @@ def found(runs):
 
 
 def test_hidden_load_radius_and_friction_come_back_within_their_intervals(found):
-    truth = {
-        COM_X: 0.02,
-        COM_Y: -0.015,
-        RADIUS: 0.94 * 0.04,
-        FRICTION: np.mean([0.18, 0.15, 0.17]) * NM_PER_A,
-    }
+    friction = np.mean([0.18, 0.15, 0.17]) * NM_PER_A
+    truth = {COM_X: 0.02, COM_Y: -0.015, RADIUS: 0.94 * 0.04, FRICTION: friction}
     margin = {COM_X: 0.001, COM_Y: 0.001, RADIUS: 0.0002, FRICTION: 0.0}
     for name, value in truth.items():
         finding = found[name]
@@ -103,9 +91,7 @@ def test_a_drive_at_one_speed_is_not_taken_for_motors_alone():
 
 
 def test_friction_of_the_measured_motors_is_near_the_described_one(measured):
-    from terrain.logs import robotino
-
-    root = measured("robotino")
-    finding = motor_friction([read() for read in robotino.find_runs(root / "dc_motor")], ROBOT)
+    runs = [read() for read in find_runs(measured("robotino") / "dc_motor")]
+    finding = motor_friction(runs, ROBOT)
     assert finding.determined
     assert finding.low < ROBOT.motors.friction_nm < finding.high

@@ -74,11 +74,11 @@ def test_without_turns_or_gyro_it_is_unknown_and_not_zero():
     assert found[LIDAR_DELAY].low < 0.25 < found[LIDAR_DELAY].high  # behind the wheels: 0.3 - 0.05
 
 
-@pytest.mark.parametrize("robot_name", ["warthog", "marmotte"])
-def test_what_the_package_states_is_what_measured_logs_show(measured, robot_name):
-    folder = {"warthog": "drive_warthog_terrains", "marmotte": "drive_marmotte"}[robot_name]
-    robot = load_robot(robot_name)
-    runs = load_runs(measured(folder), robot=robot_name)
+@pytest.mark.parametrize("name", ["warthog", "marmotte"])
+def test_what_the_package_states_is_what_measured_logs_show(measured, name):
+    folder = {"warthog": "drive_warthog_terrains", "marmotte": "drive_marmotte"}[name]
+    robot = load_robot(name)
+    runs = load_runs(measured(folder), robot=name)
     found = {f.parameter.partition(".")[2]: f for f in identify(runs, robot.wheel_radius_m, ("asphalt",))}
     for name in robot.identified:
         half = (found[name].high - found[name].low) / 2
