@@ -81,21 +81,16 @@ def log_curves(result: LearnedCurves) -> str:
         **{f"figures/{name}.png": figure_png(figure) for name, figure in result.pictures.items()},
     }
     params["n_bootstrap"] = N_BOOTSTRAP
-    with mlflow_store(create=True) as mlflow:
-        run_id = log_run(mlflow, result.table.stem, params, _metrics(result.terrains), tags, files)
-        mlflow.MlflowClient().set_terminated(run_id)
-    return run_id
-
-
-def _metrics(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Return the figures of each terrain that are known, by names that MLflow accepts."""
     keys = ("n_runs", "peak_slip", "resistance_ratio", "balance_slip", "traction_efficiency")
-    metrics: dict[str, float] = {}
-    for terrain, row in rows.items():
+    metrics: dict[str, float] = {}  # those of each terrain that are known, by names that MLflow accepts
+    for terrain, row in result.terrains.items():
         name = file_name(terrain, " ")
         metrics |= {f"{name}.{key}": float(row[key]) for key in keys if row.get(key) is not None}
         metrics |= {f"{name}.target_{state}": row["targets"][state]["slip_ratio"] for state in DRIVE_STATES}
-    return metrics
+    with mlflow_store(create=True) as mlflow:
+        run_id = log_run(mlflow, result.table.stem, params, metrics, tags, files)
+        mlflow.MlflowClient().set_terminated(run_id)
+    return run_id
 
 
 TERRAINS = (
@@ -184,7 +179,15 @@ def curve_figures(learned: Sequence[LearnedTerrain], robot: str) -> dict[str, Fi
     )
     figures, panels = {}, []
     for entry in learned:
-        panel, headline = curve_panel(entry), _headline(entry)
+        headline = f"{entry.status}, {entry.reason}"
+        if (curve := entry.curve) is not None:
+            kind = "peak" if curve.peak.status is PeakStatus.PEAK else "no peak, 95 %"
+            headline = (
+                f"{LAW_NAMES[curve.law]}, {kind} at {format_value(curve.peak.slip_ratio, SLIP)} "
+                f"({format_value(curve.peak_interval, SLIP)}), {curve.n_runs} runs"
+                f"{f', {entry.reason}' if entry.reason else ''}"
+            )
+        panel = curve_panel(entry)
         panels.append(replace(panel, title=f"{entry.terrain}: {headline}"))
         title = f"{entry.terrain}, {robot}: {headline}"
         figures[entry.terrain] = Figure(title, (panel,), caption, x_label="slip ratio")
@@ -219,14 +222,3 @@ def curve_panel(entry: LearnedTerrain) -> Panel:
     least, most = min(shown), min(max(shown), LARGEST_THRUST_RATIO)
     margins = (least - 0.08 * (most - least), most + 0.12 * (most - least))
     return Panel(marks, "thrust over load", x_range=(-0.03, 1.0), y_range=margins)
-
-
-def _headline(entry: LearnedTerrain) -> str:
-    if (curve := entry.curve) is None:
-        return f"{entry.status}, {entry.reason}"
-    kind = "peak" if curve.peak.status is PeakStatus.PEAK else "no peak, 95 %"
-    tail = f", {entry.reason}" if entry.reason else ""
-    return (
-        f"{LAW_NAMES[curve.law]}, {kind} at {format_value(curve.peak.slip_ratio, SLIP)} "
-        f"({format_value(curve.peak_interval, SLIP)}), {curve.n_runs} runs{tail}"
-    )

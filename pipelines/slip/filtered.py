@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -78,22 +78,18 @@ def estimate_all(
         return summarize(found), enriched(found), partial(figures_of, found)
 
     found = estimate_each(runs, name, estimate, progress, keep)
-    clocks = _clocks_apart(runs, robot_of) if name == "skid" else ()
+    clocks: tuple[str, ...] = ()
+    if name == "skid":  # the turns of a robot that skids show where the clocks of wheels and IMU are apart
+        from terrain.logs.clock import offsets_apart_s
+
+        if apart := offsets_apart_s(runs, lambda run: robot_of(run).track_m):
+            worst = max(apart, key=lambda run_id: abs(apart[run_id]))
+            clocks = (
+                f"the clocks of wheels and IMU are apart in {len(apart)} of {len(runs)} runs, by "
+                f"{apart[worst]:+.2f} s in {worst}: tracks and yaw rates of these are wrong; --align brings the wheels "
+                "onto the IMU's clock",
+            )
     return FilterResult(**found, tuning=tuning, tuned=tuned, clocks=clocks)
-
-
-def _clocks_apart(runs: Sequence[RunLog], robot_of: Callable[[RunLog], Robot]) -> tuple[str, ...]:
-    """Return a sentence where the clocks of wheels and IMU are apart, as the turns of a robot that skids show it."""
-    from terrain.logs.clock import offsets_apart_s
-
-    apart = offsets_apart_s(runs, lambda run: robot_of(run).track_m)
-    if not apart:
-        return ()
-    worst = max(apart, key=lambda run_id: abs(apart[run_id]))
-    return (
-        f"the clocks of wheels and IMU are apart in {len(apart)} of {len(runs)} runs, by {apart[worst]:+.2f} s in "
-        f"{worst}: tracks and yaw rates of these are wrong; --align brings the wheels onto the IMU's clock",
-    )
 
 
 RUNS = (
@@ -129,22 +125,22 @@ def report(result: FilterResult) -> Report:
     if (tuned := result.tuned) is not None:
         scales = [f"{name} {scale:.3g} ({tuned.status[name]})" for name, scale in tuned.scales.items()]
         parts.append(Text(f"Process variances scaled on {', '.join(tuned.runs)}: {', '.join(scales)}."))
+    motions = []
+    for row in result.runs:
+        if (motion := row.motion) is not None:
+            times = ", ".join(f"{each.start_s:.1f} to {each.end_s:.1f} s" for each in row.stuck or ())
+            motions.append(
+                f"{row.run_id}: {f'stuck from {times}' if times else 'not seen to be stuck'}; moving for "
+                f"{motion['moving']:.1f} s, at rest for {motion['at_rest']:.1f} s, unknown for "
+                f"{motion['unknown']:.1f} s"
+            )
     return tracks_report(
         result,
         f"Motion and slip by {result.filter}",
         _answer(result),
         (result.runs, columns, f"filter {result.filter}, {result.tuning} noise"),
-        ("At rest, moving, stuck", [_motion_text(row) for row in result.runs if row.motion is not None]),
+        ("At rest, moving, stuck", motions),
         parts,
-    )
-
-
-def _motion_text(row: EstimateSummary) -> str:
-    motion = row.motion or {}
-    times = ", ".join(f"{each.start_s:.1f} to {each.end_s:.1f} s" for each in row.stuck or ())
-    return (
-        f"{row.run_id}: {f'stuck from {times}' if times else 'not seen to be stuck'}; moving for "
-        f"{motion['moving']:.1f} s, at rest for {motion['at_rest']:.1f} s, unknown for {motion['unknown']:.1f} s"
     )
 
 
@@ -190,7 +186,9 @@ def motion_figure(estimate: Estimate) -> Figure:
         stuck = [Strip([(each.start_s, each.end_s, "stuck") for each in intervals])]
     panels = []
     for state, sensors in _measured(estimate).items():
-        marks = [Line(sensor, table.time_s, sensors[sensor], i) for i, sensor in enumerate(sensors, start=1)]
+        marks: list[Mark] = [
+            Line(each, table.time_s, sensors[each], i) for i, each in enumerate(sensors, start=1)
+        ]
         true = None if estimate.truth is None else estimate.truth[:, track.states.index(state)]
         known = true if true is not None and np.isfinite(true).any() else None
         marks += estimated(name, track.time_s, track.state(state), track.std(state), 2, known)
@@ -199,7 +197,23 @@ def motion_figure(estimate: Estimate) -> Figure:
     if name in SEEING:
         rows = [f"camera_{state}" for state in LABELS if state in track.states]
     innovations = estimate.innovations if rows else {}
-    panels += [_innovation_panel(estimate, row, *innovations[row]) for row in rows]
+    for row in rows:
+        value, std = innovations[row]
+        sensor = next(k for k, (_, names) in enumerate(estimate.model.sensors) if row in names)
+        gated = track.use[:, sensor] == GATED
+        used = value[~gated & np.isfinite(value)]
+        marks = [
+            Band("± 2 std expected", track.time_s, -2 * std, 2 * std, 6),
+            Line("innovation", track.time_s, np.where(gated, np.nan, value), 0),
+        ]
+        if gated.any():
+            marks.append(Points("gated", track.time_s[gated], np.zeros(gated.sum()), colour=5))
+        title, reach = f"innovation of {row}, variance none", None
+        if used.size:
+            title = f"innovation of {row}, variance {used.var():.1e}"
+            most = 1.2 * max(float(np.nanmax(2 * std)), float(np.percentile(np.abs(used), 99.5)))
+            reach = -most, most
+        panels.append(Panel(marks, "innovation", title, y_range=reach))
     return Figure(
         f"{estimate.run.run_id}: motion by {name}",
         panels,
@@ -231,24 +245,6 @@ def _measured(estimate: Estimate) -> dict[str, dict[str, Array]]:
             found[state]["camera, at its place"] = table.columns([f"camera_{state}"])[:, 0]
     found["yaw_rate_radps"] |= gyro
     return found
-
-
-def _innovation_panel(estimate: Estimate, row: str, value: Array, std: Array) -> Panel:
-    track = estimate.track
-    sensor = next(k for k, (_, rows) in enumerate(estimate.model.sensors) if row in rows)
-    gated = track.use[:, sensor] == GATED
-    used = value[~gated & np.isfinite(value)]
-    marks: list[Mark] = [
-        Band("± 2 std expected", track.time_s, -2 * std, 2 * std, 6),
-        Line("innovation", track.time_s, np.where(gated, np.nan, value), 0),
-    ]
-    if gated.any():
-        marks.append(Points("gated", track.time_s[gated], np.zeros(gated.sum()), colour=5))
-    title, reach = f"innovation of {row}, variance none", None
-    if used.size:
-        title = f"innovation of {row}, variance {used.var():.1e}"
-        reach = 1.2 * max(float(np.nanmax(2 * std)), float(np.percentile(np.abs(used), 99.5)))
-    return Panel(marks, "innovation", title, y_range=None if reach is None else (-reach, reach))
 
 
 def slip_figure(estimate: Estimate) -> Figure:

@@ -158,7 +158,25 @@ def report(result: MeasuredSlipResult) -> Report:
         about = "slip predicted from currents and wheel speeds alone"
         parts.append(Table(PREDICTIONS, result.predictions, about))
     if result.rollers is not None:
-        parts += _roller_parts(result, result.rollers)
+        found = (
+            result.rollers
+        )  # what of the slip is the robot's own, which surfaces it names, and where wheels are
+        columns = (
+            Column("surface", of=str),
+            Column("roller friction", SLIP, of=found.roller_ratio.get),
+            Column("95 %", SLIP, of=found.roller_interval.get),
+            Column("RMS of slip left, held out", FINE, of=found.held_out_rms.get),
+            Column("about the mean", FINE, of=found.plain_rms.get),
+        )
+        note = "Friction of the rollers over the stiffness of traction, both in proportion to a wheel's load."
+        parts.append(Table(columns, list(found.roller_ratio), "what makes it slip", note))
+        sentences = list(found.sentences)
+        for each in result.named:
+            fitted = ", fitted" if each.group in found.roller_ratio else ", not fitted"
+            shown = fitted if each.n_right is not None else ""
+            sentences.append(f"{each.group or UNLABELLED}{shown}: {each.text}.")
+        sentences += [f"{name}: {bound.sentence}" for name, bound in result.distances.items()]
+        parts += map(Text, sentences)
     spinning = [name for row in result.surfaces for name in row.spinning]
     if spinning:
         names = ", ".join(spinning[:8])
@@ -198,26 +216,6 @@ def _answer(result: MeasuredSlipResult) -> str:
     if any(row.n_windows for row in result.surfaces):
         return f"No slip is known in steady motion, measured by {sources}."
     return f"No window of {result.window_s:g} s is covered by {sources}; a shorter --window may be."
-
-
-def _roller_parts(result: MeasuredSlipResult, found: RollerFindings) -> list[Part]:
-    """Return what of the slip is the robot's own, which surfaces rollers name, and where the wheels are."""
-    columns = (
-        Column("surface", of=str),
-        Column("roller friction", SLIP, of=found.roller_ratio.get),
-        Column("95 %", SLIP, of=found.roller_interval.get),
-        Column("RMS of slip left, held out", FINE, of=found.held_out_rms.get),
-        Column("about the mean", FINE, of=found.plain_rms.get),
-    )
-    note = "Friction of the rollers over the stiffness of traction, both in proportion to a wheel's load."
-    sentences = list(found.sentences)
-    for each in result.named:
-        fitted = ", fitted" if each.group in found.roller_ratio else ", not fitted"
-        sentences.append(
-            f"{each.group or UNLABELLED}{fitted if each.n_right is not None else ''}: {each.text}."
-        )
-    sentences += [f"{name}: {bound.sentence}" for name, bound in result.distances.items()]
-    return [Table(columns, list(found.roller_ratio), "what makes it slip", note), *map(Text, sentences)]
 
 
 def _pictures(

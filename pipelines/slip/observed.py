@@ -91,20 +91,19 @@ def report(result: ObserverResult) -> Report:
         for run in result.runs
         for name, slip in run.slip.items() or [("not estimated", None)]
     ]
+    statuses = []
+    for run in result.runs:
+        times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in run.status_s.items())
+        dropped = f"; left out: {sum(run.dropped.values())} samples" if run.dropped else ""
+        missing = f"; not measured: {', '.join(run.missing)}" if run.missing else ""
+        statuses.append(f"{run.run_id}: {times}{dropped}{missing}")
     return tracks_report(
         result,
         f"Slip by the observer {result.filter}",
         _answer(result),
         (rows, SLIPS, f"observer {result.filter}"),
-        ("Statuses", [_status_text(row) for row in result.runs]),
+        ("Statuses", statuses),
     )
-
-
-def _status_text(row: ObserverSummary) -> str:
-    times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in row.status_s.items())
-    dropped = f"; left out: {sum(row.dropped.values())} samples" if row.dropped else ""
-    missing = f"; not measured: {', '.join(row.missing)}" if row.missing else ""
-    return f"{row.run_id}: {times}{dropped}{missing}"
 
 
 def _answer(result: ObserverResult) -> str:

@@ -102,7 +102,12 @@ def calibrate(settings: Settings, progress: Progress) -> SoilResult:
         law = settings.laws, settings.draws, settings.seed
         result, shown, predictions = compare_laws(trials_of(own, wheel), checked, wheel, *law, progress)
         if out is not None:
-            result = _written(result, out, settings.dataset)
+            name, soil = f"testbed_sand_{result.wheel}", result.soil
+            file, friction = out / f"{name}.yaml", result.parameters["tan_friction"]
+            atomic_write(
+                file, soil_yaml(name, result.wheel, settings.dataset, soil.fit, friction, result.law)
+            )
+            result = replace(result, soil=soil._replace(file=file))
         results.append(result)
         for held, text in LEFT_OUT.items():
             pictures[f"{wheel.name}_{text}"] = held_out_figure(result, shown, predictions[held], held)
@@ -120,22 +125,23 @@ def calibrate(settings: Settings, progress: Progress) -> SoilResult:
     )
 
 
-def _written(result: WheelResult, out: Path, dataset: str) -> WheelResult:
-    """Write the soil of a wheel, and name the file in its result."""
-    name, soil = f"testbed_sand_{result.wheel}", result.soil
-    text = soil_yaml(name, result.wheel, dataset, soil.fit, result.parameters["tan_friction"], result.law)
-    file = out / f"{name}.yaml"
-    atomic_write(file, text)
-    return replace(result, soil=soil._replace(file=file))
-
-
 def report(result: SoilResult) -> Report:
     """Return the laws of each wheel with their errors on what was left out, the parameters and the limits."""
     parts: list[Part] = []
     details: list[Section] = []
     for wheel in result.wheels:
         figures = [each for name, each in result.pictures.items() if name.startswith(f"{wheel.wheel}_")]
-        parts += [_laws_table(wheel), Text(wheel.verdict)]
+        rows: list[dict[str, Any]] = [
+            law._asdict() | {"given": given} | {out: getattr(getattr(law, out), given) for out in HELD_OUT}
+            for law in wheel.laws
+            for given in GIVEN
+            if math.isfinite(getattr(law.slip, given).pull_ratio)
+        ]
+        polynomial = {"slip": wheel.surrogate_slip, "angle": wheel.surrogate_angle}
+        rows.append({"name": "(polynomial of slip and angle)", "given": "load", **polynomial})
+        title = f"{wheel.wheel} wheel, {wheel.n_trials} trials: errors over the load"
+        note = "Root mean squares over the measured load, with slip and angle given."
+        parts += [Table(LAWS, rows, title, note), Text(wheel.verdict)]
         details += sections((f"{wheel.wheel} wheel", [*_wheel_details(wheel), *figures]))
     answers = " and ".join(f"{each.laws[-1].slip.load.forces} ({each.wheel} wheel)" for each in result.wheels)
     soil = next((wheel.soil.file for wheel in result.wheels if wheel.soil.file is not None), "FILE")
@@ -168,22 +174,6 @@ PARAMETERS = (
 )
 
 MISFITS = (Column("", of="name"), Column("trials", of="misfit.n_trials"), *_errors("misfit"))
-
-
-def _laws_table(wheel: WheelResult) -> Table:
-    rows: list[dict[str, Any]] = [
-        law._asdict() | {"given": given} | {out: getattr(getattr(law, out), given) for out in HELD_OUT}
-        for law in wheel.laws
-        for given in GIVEN
-        if math.isfinite(getattr(law.slip, given).pull_ratio)
-    ]
-    polynomial = {"slip": wheel.surrogate_slip, "angle": wheel.surrogate_angle}
-    return Table(
-        LAWS,
-        [*rows, {"name": "(polynomial of slip and angle)", "given": "load", **polynomial}],
-        f"{wheel.wheel} wheel, {wheel.n_trials} trials: errors over the load",
-        "Root mean squares over the measured load, with slip and angle given.",
-    )
 
 
 def _wheel_details(wheel: WheelResult) -> list[Part]:
