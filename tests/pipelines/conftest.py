@@ -1,10 +1,13 @@
 """Small labelled runs with a known truth, and one trained model for all tests that need one."""
 
 import math
-import os
 import shutil
+import sqlite3
 import sys
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -97,20 +100,23 @@ def tracked(tmp_path_factory, runs):
 
     Made once: a new tracking database costs seconds.  ``model/`` beside ``mlruns/`` is the model by itself.
     """
+    from sqlalchemy import Engine, event
+
     from pipelines.learn.train import TrainingSettings, train
 
+    @event.listens_for(Engine, "connect")
+    def wait_for_no_disk(connection, _):  # in each of the two hundred commits of a new database
+        with suppress(sqlite3.DatabaseError):
+            connection.execute("PRAGMA synchronous=OFF")
+
     folder = tmp_path_factory.mktemp("tracked")
-    before, named = Path.cwd(), os.environ.pop("MLFLOW_TRACKING_URI", None)
-    os.chdir(folder)
-    try:
-        asked = TrainingSettings(name="drawn", repeats=1, n_jobs=1)
+    asked = TrainingSettings(name="drawn", repeats=1, n_jobs=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("MLFLOW_TRACKING_URI", raising=False)
+        patch.chdir(folder)
         result = train(data_of_runs(runs, asked), asked, "twelve runs")
-        (model,) = Path("mlruns").rglob("model.skops")
-        shutil.copytree(model.parent, "model")
-    finally:
-        os.chdir(before)
-        if named is not None:
-            os.environ["MLFLOW_TRACKING_URI"] = named
+    (model,) = (folder / "mlruns").rglob("model.skops")
+    shutil.copytree(model.parent, folder / "model")
     return folder, result
 
 
@@ -120,17 +126,11 @@ def model(tracked):
     return read_model(tracked[0] / "model")
 
 
-class Giving:
-    """Stands in for a recipe: gives what a function of windows returns."""
-
-    def __init__(self, classes, outputs):
-        self.classes_, self.predict_proba = np.array(classes), outputs
-
-
 @pytest.fixture(scope="session")
 def giving(model):
     """Return a function that makes a model like ``model``, whose outputs are those of a function of windows."""
-    return lambda outputs: TerrainModel(Giving(model.info.classes, outputs), model.info)
+    classes = np.array(model.info.classes)
+    return lambda outputs: TerrainModel(SimpleNamespace(classes_=classes, predict_proba=outputs), model.info)
 
 
 @pytest.fixture
@@ -148,18 +148,14 @@ def model_dir(tracked, tmp_path):
     return Path(shutil.copytree(tracked[0] / "model", tmp_path / "model"))
 
 
-def _trained(runs):
-    return fitted_model(runs, dataset="drawn")
-
-
 @pytest.fixture(scope="session")
 def trained():
     """What trains a model on labelled runs, with the default settings."""
-    return _trained
+    return partial(fitted_model, dataset="drawn")
 
 
 @pytest.fixture(scope="session")
-def swerve_model():
+def swerve_model(trained):
     """Trained on what a filter adds to simulated runs of two terrains."""
     robot = load_robot("agrimaro")
     runs = [
@@ -167,7 +163,7 @@ def swerve_model():
         for terrain in ("grass", "tiles")
         for number in (1, 2)
     ]
-    return _trained([enriched(estimate_run(run, robot, "vio15")) for run in runs])
+    return trained([enriched(estimate_run(run, robot, "vio15")) for run in runs])
 
 
 def as_sent(stream, values):
@@ -227,5 +223,5 @@ def two_drives():
 
 
 @pytest.fixture(scope="session")
-def mower_model(two_drives):
-    return _trained(two_drives)
+def mower_model(trained, two_drives):
+    return trained(two_drives)

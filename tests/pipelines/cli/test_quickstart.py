@@ -55,11 +55,12 @@ def test_other_runs_in_the_folder_are_not_overwritten(make_run, tmp_path, monkey
 
 
 @pytest.mark.slow
-def test_quickstart_needs_no_data(in_tracked, tmp_path):
+def test_quickstart_needs_no_data(in_tracked, tmp_path, monkeypatch):
+    monkeypatch.setattr("pipelines.slip.labelled.soil_names", lambda: ("grass", "tiles", "clay"))
     result = run(Settings(out=tmp_path / "out", name="from_nothing", runs_a_terrain=2, n_jobs=1))
     found = as_json(result)
-    assert found["imported"] == {"out": str(tmp_path / "out" / "runs"), "n_runs": 16, "reused": False}
-    assert len(found["slip"]) == 8
+    assert found["imported"] == {"out": str(tmp_path / "out" / "runs"), "n_runs": 6, "reused": False}
+    assert len(found["slip"]) == 3
     assert result.commands[0].startswith("terrain simulate --robot agrimaro --terrain all")
     assert (tmp_path / "out" / "report.html").read_text().count('class="plot"') >= 3
     assert len(terminal_text(result.report).splitlines()) <= 25
@@ -73,9 +74,7 @@ def test_runs_are_chosen_by_id(make_run, tmp_path):
     def chosen(**options):
         return [each.run_id for each in load(AlignedRunsSettings(data=tmp_path, **options))[0]]
 
-    assert chosen() == ["a0", "a1", "a2"]
-    assert chosen(only=("a2", "a0")) == ["a0", "a2"]
-    assert chosen(without=("a1",)) == ["a0", "a2"]
+    assert chosen(only=("a2", "a0")) == chosen(without=("a1",)) == ["a0", "a2"]
     assert chosen(only=("a0", "a1"), without=("a1",)) == ["a0"]
     with pytest.raises(ConfigError, match="--without: there is no run 'b'; there are a0, a1, a2"):
         chosen(without=("b",))
