@@ -147,11 +147,13 @@ def row(fault, place, duration_s=3.0):
 
 LOSSES = ("loss_all", "loss_wheels", "freeze_wheels", "freeze_camera_speed", "freeze_pitch")
 STEPS = ("step_camera_speed", "step_camera_speed_down", "step_pitch")
+SLOW = [*((fault, math.inf) for fault in LOSSES), *((fault, 3.0) for fault in STEPS)]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("duration_s", [3.0, math.inf])
-@pytest.mark.parametrize("fault", [*LOSSES, *STEPS])
+@pytest.mark.parametrize(
+    ("fault", "duration_s"),
+    [("freeze_wheels", 3.0), *(pytest.param(*one, marks=pytest.mark.slow) for one in SLOW)],
+)
 def test_a_fault_at_the_brake_on_slick_ground_ends_the_braking_by_slip(fault, duration_s):
     clean, plain, _ = references(STOP)
     assert braking_by_slip(SLICK.curves["wet_floor"]) is not None

@@ -94,13 +94,14 @@ def test_after_a_refused_start_the_port_is_free_and_no_thread_is_left(
 
 
 def test_damaged_states_of_robots_do_not_keep_the_service_from_starting(model_folder, tmp_path):
-    for name, content in {"bytes": b"\xff\x00", "half": b'{"version": 1', "deep": b"[" * 60_000}.items():
+    damaged = {"bytes": b"\xff\x00", "half": b'{"version": 1', "deep": b"[" * 60_000}
+    for name, content in damaged.items():
         (tmp_path / f"{name}.json").write_bytes(content)
     (tmp_path / "folder.json").mkdir()
     with running(model=str(model_folder), state=tmp_path) as service:
-        for name in ("bytes", "half", "deep", "folder", "new"):
+        for name in (*damaged, "folder", "new"):
             with service.socket() as robot:
                 welcome = ask(robot, hello(name))
                 assert (welcome["type"], welcome["restored"]) == ("welcome", None)
         trouble = json.loads(service.get("/ready")[1])["trouble"]
-        assert {"state of bytes", "state of half", "state of deep", "state of folder"} <= set(trouble)
+        assert {f"state of {name}" for name in (*damaged, "folder")} <= set(trouble)
