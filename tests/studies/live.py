@@ -22,7 +22,7 @@ from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
 from pipelines.report.tree import Column, Pairs, Report, Table
 from studies import service as serving
-from studies.service import ROBOT, Packed, Spread, packed, spread
+from studies.service import ROBOT, Packed, Spread, spread
 from terrain.estimation.estimate import enriched, estimate_run
 from terrain.logs.replay import replay
 from terrain.records import RunLog, Windows
@@ -166,12 +166,12 @@ def run(settings: Settings, progress: Progress = silent) -> LiveLatencies:
         channels = serving.sent_channels(log)
         begun_s = perf_counter()
         with serving.service_process(["--model", uri, "--robot", ROBOT]) as service:
-            each = _within(packed(list(serving.messages_of(log, 100.0, 100.0))), settings.seconds)
+            each = _within(serving.messages_of(log, 100.0, 100.0), settings.seconds)
             asyncio.run(serving.drive(service.socket_url, serving.hello("first", channels), each[:3]))
             start_s, rss_mb = perf_counter() - begun_s, service.rss_mb
             one = asyncio.run(serving.drive(service.socket_url, serving.hello("one", channels), each))
             progress("live", 5, n_stages)
-            messages = _within(packed(list(serving.messages_of(log))), settings.seconds)
+            messages = _within(serving.messages_of(log), settings.seconds)
             by_sessions = []
             for stage, share in enumerate(SHARES):
                 n = max(math.ceil(share * settings.robots), 1)
@@ -190,7 +190,7 @@ def run(settings: Settings, progress: Progress = silent) -> LiveLatencies:
 
 
 def _within(messages: list[Packed], seconds: float) -> list[Packed]:
-    return [one for one in messages if one.time_s <= seconds]
+    return [one for one in messages if one.time_s - messages[0].time_s <= seconds]
 
 
 def report(result: LiveLatencies) -> Report:

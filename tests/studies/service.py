@@ -78,27 +78,8 @@ def sent_channels(run: RunLog) -> dict[str, list[str]]:
     return {name: list(run.streams[name].channels) for name in CHANNELS if name in run.streams}
 
 
-def messages_of(
-    run: RunLog, rate_hz: float = IMU_RATE_HZ, step_rate_hz: float = STEP_RATE_HZ
-) -> Iterator[dict[str, Any]]:
-    """Yield the messages of a robot: samples at one rate, of which some ask for a step."""
-    every = round(rate_hz / step_rate_hz)
-    for k, sample in enumerate(replay(run, rate_hz)):
-        streams = {
-            name: [
-                reading.time_s.tolist(),
-                [[None if v != v else v for v in row] for row in reading.values.tolist()],
-            ]
-            for name, reading in sample.readings.items()
-        }
-        content: dict[str, Any] = {"type": "samples", "streams": streams, "time_s": float(sample.time_s)}
-        if k % every == 0:
-            content |= {"twist": sample.twist.tolist(), "step": True}
-        yield content
-
-
 class Packed(NamedTuple):
-    """A message as it is sent, when, whether it asks for a step, and its rows."""
+    """A message as it is sent; its time on the robot's clock, whether it asks for a step, and its rows."""
 
     message: bytes
     time_s: float
@@ -106,18 +87,26 @@ class Packed(NamedTuple):
     rows: int
 
 
-def packed(messages: Sequence[dict[str, Any]]) -> list[Packed]:
-    """Return messages as they are sent, at the times of their steps."""
-    first_s = float(messages[0]["time_s"])
-    return [
-        Packed(
-            msgpack.packb(content),
-            content["time_s"] - first_s,
-            bool(content.get("step")),
-            sum(len(time_s) for time_s, _ in content["streams"].values()),
-        )
-        for content in messages
-    ]
+def messages_of(
+    run: RunLog, rate_hz: float = IMU_RATE_HZ, step_rate_hz: float = STEP_RATE_HZ, ahead_s: float = 0.0
+) -> list[Packed]:
+    """Return the messages of a robot whose clock is ahead: samples at one rate, of which some ask for a step."""
+    every, messages = round(rate_hz / step_rate_hz), []
+    for k, sample in enumerate(replay(run, rate_hz)):
+        streams = {
+            name: [
+                (reading.time_s + ahead_s).tolist(),
+                [[None if v != v else v for v in row] for row in reading.values.tolist()],
+            ]
+            for name, reading in sample.readings.items()
+        }
+        time_s, step = float(sample.time_s) + ahead_s, k % every == 0
+        content: dict[str, Any] = {"type": "samples", "streams": streams, "time_s": time_s}
+        if step:
+            content |= {"twist": sample.twist.tolist(), "step": True}
+        rows = sum(len(reading.time_s) for reading in sample.readings.values())
+        messages.append(Packed(msgpack.packb(content), time_s, step, rows))
+    return messages
 
 
 def hello(session: str, channels: dict[str, list[str]]) -> bytes:
@@ -148,7 +137,7 @@ async def drive(url: str, first: bytes, messages: Sequence[Packed], delay_s: flo
         answer = msgpack.unpackb(await socket.recv())
         if answer.get("type") != "welcome":
             raise TerrainError(f"the service refuses a robot: {answer.get('message')}")
-        begin_s = monotonic() + delay_s
+        begin_s = monotonic() + delay_s - messages[0].time_s
         for one in messages:
             await asyncio.sleep(max(begin_s + one.time_s - monotonic(), 0.0))
             sent_s = monotonic()

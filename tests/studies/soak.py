@@ -25,11 +25,11 @@ from pipelines.report.settings import setting
 from pipelines.report.tree import Report, Table, Text
 from studies.service import (
     ROBOT,
+    Packed,
     ServiceProcess,
     hello,
     messages_of,
     model_folder,
-    packed,
     sent_channels,
     study_drive,
 )
@@ -103,18 +103,12 @@ class _Seen:
 
 
 class _Robot:
-    """One robot that drives again and again, and meets the faults that are due.
-
-    Its clock is ``number`` times :data:`CLOCKS_APART_S` ahead.
-    """
+    """One robot that drives again and again, and meets the faults that are due."""
 
     def __init__(
-        self, number: int, channels: dict[str, list[str]], messages: Sequence[Any], seen: _Seen, seed: int
+        self, number: int, channels: dict[str, list[str]], messages: Sequence[Packed], seen: _Seen, seed: int
     ) -> None:
-        ahead_s = CLOCKS_APART_S * number
-        self._first = hello(f"soak-{number}", channels)
-        self._messages = packed([_later(content, ahead_s) for content in messages])
-        self._begin_s = ahead_s + messages[0]["time_s"]
+        self._first, self._messages = hello(f"soak-{number}", channels), messages
         self._seen, self._rng = seen, np.random.default_rng([seed, number])
         self._own_clock, self._waits_for_itself = True, False
         self.due: list[str] = []
@@ -138,7 +132,7 @@ class _Robot:
             await asyncio.sleep(0.5)
             await socket.send(self._first)
         self._own_clock = True
-        begin_s = monotonic()
+        begin_s = monotonic() - self._messages[0].time_s
         for one in self._messages:
             if monotonic() > end_s:
                 return
@@ -147,7 +141,7 @@ class _Robot:
                 return
             await socket.send(one.message)
             if one.step:
-                await self._answer(socket, self._begin_s + one.time_s, asked_s=monotonic())
+                await self._answer(socket, one.time_s, asked_s=monotonic())
 
     async def _answer(self, socket: ClientConnection, time_s: float, asked_s: float) -> None:
         """Wait for the step that was asked for at a time of the robot's clock, and judge it."""
@@ -179,8 +173,8 @@ class _Robot:
         self._waits_for_itself = False
         window = answer["observation"]["window"]
         if window is not None and self._own_clock:
-            length_s = self._messages[-1].time_s + CLOCKS_APART_S / 2
-            if not self._begin_s - 1.0 < window["start_s"] < window["end_s"] < self._begin_s + length_s:
+            first_s, last_s = self._messages[0].time_s - 1.0, self._messages[-1].time_s + CLOCKS_APART_S / 2
+            if not first_s < window["start_s"] < window["end_s"] < last_s:
                 seen.wrong_session += 1
 
     async def _fault(self, socket: ClientConnection, kind: str) -> bool:
@@ -215,15 +209,6 @@ class _Robot:
         if streams is not None:
             await socket.send(msgpack.packb({"type": "samples", "streams": streams}))
         return False
-
-
-def _later(content: dict[str, Any], by_s: float) -> dict[str, Any]:
-    """Return a message as a robot whose clock is ahead would send it."""
-    streams = {
-        name: [[stamp + by_s for stamp in stamps], rows]
-        for name, (stamps, rows) in content["streams"].items()
-    }
-    return {**content, "time_s": content["time_s"] + by_s, "streams": streams}
 
 
 async def _run(
@@ -279,14 +264,16 @@ def _swap(service: ServiceProcess, uri: str, seen: _Seen) -> None:
 def run(settings: Settings, progress: Progress = silent) -> Soak:
     """Load a service of its own process with robots and faults, and judge what it did."""
     log, seen = study_drive(settings.seed), _Seen()
-    channels, messages = sent_channels(log), list(messages_of(log))
     with TemporaryDirectory() as folder:
         uri = model_folder(settings.model, settings.seed, Path(folder) / "model")
         states = Path(folder) / "states" if settings.out is None else settings.out
         service = ServiceProcess(["--model", uri, "--robot", ROBOT, "--state", str(states)])
         try:
             robots = [
-                _Robot(number, channels, messages, seen, settings.seed) for number in range(settings.robots)
+                _Robot(
+                    k, sent_channels(log), messages_of(log, ahead_s=CLOCKS_APART_S * k), seen, settings.seed
+                )
+                for k in range(settings.robots)
             ]
             asyncio.run(_run(service, robots, uri, settings, seen, progress))
             seen.rss_mb.append(service.rss_mb)

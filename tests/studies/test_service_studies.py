@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from studies import live, soak
-from studies.service import messages_of, model_folder, packed, sent_channels, study_drive
+from studies.service import Packed, messages_of, model_folder, sent_channels, study_drive
 
 
 @pytest.fixture(scope="module")
@@ -23,15 +23,15 @@ def uri(tmp_path_factory):
 
 
 def test_messages_hold_every_sample_of_the_drive_once(run):
-    messages, channels = list(messages_of(run)), sent_channels(run)
+    messages, channels = messages_of(run, ahead_s=7.0), sent_channels(run)
+    contents = [msgpack.unpackb(one.message) for one in messages]
     for stream in channels:
-        sent = [t for one in messages if stream in one["streams"] for t in one["streams"][stream][0]]
-        assert sent == run.streams[stream].time_s.tolist()
-    steps = [one["time_s"] for one in messages if one.get("step")]
-    assert np.diff(steps) == pytest.approx(0.05, abs=1e-9)
-    bytes_ = packed(messages)
-    assert sum(one.rows for one in bytes_) == sum(len(run.streams[stream]) for stream in channels)
-    assert bytes_[0].time_s == 0.0
+        sent = [t for one in contents if stream in one["streams"] for t in one["streams"][stream][0]]
+        assert sent == pytest.approx(run.streams[stream].time_s + 7.0, abs=1e-9)
+    assert [one["time_s"] for one in contents] == [one.time_s for one in messages]
+    assert [one.get("step", False) for one in contents] == [one.step for one in messages]
+    assert np.diff([one.time_s for one in messages if one.step]) == pytest.approx(0.05, abs=1e-9)
+    assert sum(one.rows for one in messages) == sum(len(run.streams[stream]) for stream in channels)
 
 
 @pytest.mark.slow
@@ -88,16 +88,14 @@ def test_what_is_not_accepted_is_named(changed, problem):
 COMMAND = {"wheel_radps": [0.0], "steer_rad": [0.0], "twist": [0.0], "valid_s": 1.0}
 
 
-def robot_of(number=0, end_s=0.0):
-    message = {"streams": {"imu": [[0.01], [[0.0]]]}, "time_s": 0.01}
-    messages = [message, {**message, "time_s": end_s}] if end_s else [message]
-    return soak._Robot(number, {"imu": ["gyro_z_radps"]}, messages, soak._Seen(), 0)
+def robot_of(*times_s):
+    messages = [Packed(b"", time_s, True, 1) for time_s in times_s]
+    return soak._Robot(2, {"imu": ["gyro_z_radps"]}, messages, soak._Seen(), 0)
 
 
 @pytest.mark.parametrize(("end_s", "n"), [(2005.0, 0), (5.0, 1), (3005.0, 1)])
 def test_a_window_by_another_robots_clock_is_one_of_another_robot(end_s, n):
-    robot = robot_of(2, 40.0)
-    assert [one.time_s for one in robot._messages] == pytest.approx([0.0, 39.99])
+    robot = robot_of(2000.0, 2040.0)
     answer = {"command": COMMAND, "observation": {"window": {"start_s": end_s - 2.0, "end_s": end_s}}}
     robot._judge(answer, time.monotonic())
     assert (robot._seen.steps, robot._seen.wrong_session) == (1, n)
@@ -122,6 +120,6 @@ def test_an_answer_is_that_of_its_request(monkeypatch, answers, steps, unanswere
             step = {"type": "step", "time_s": float(what[-1]), "command": COMMAND}
             return msgpack.packb({**step, "observation": {"window": None}})
 
-    robot = robot_of()
+    robot = robot_of(0.0)
     asyncio.run(robot._answer(Socket(), 2.0, time.monotonic()))
     assert (robot._seen.steps, robot._seen.unanswered) == (steps, unanswered)
