@@ -61,13 +61,6 @@ class LabelStudy(Result):
     differences: Mapping[str, Difference] = described("of two strategies, paired by run")
 
 
-class _FoldLabels(NamedTuple):
-    """Probabilities (strategies, n, k) of a fold's test rows, and the runs that were labelled for each."""
-
-    probability: Array
-    n_labelled: tuple[int, ...]
-
-
 def run(settings: Settings, progress: Progress = silent) -> LabelStudy:
     """Compare strategies on a folder of labelled runs."""
     data, repeats = settings.data, settings.repeats
@@ -83,9 +76,9 @@ def run(settings: Settings, progress: Progress = silent) -> LabelStudy:
     counts = []
     each = [(fold, settings.seed + number) for number, fold in enumerate(folds)]
     given = _fold_labels, (recipe[-1], examples, motion), each, evaluation.jobs
-    for fold, found in zip(folds, parallel(*given, "labels", progress), strict=True):
-        probability[:, fold.repeat, fold.test] = found.probability
-        counts.append(found.n_labelled)
+    for fold, (found, n_labelled) in zip(folds, parallel(*given, "labels", progress), strict=True):
+        probability[:, fold.repeat, fold.test] = found
+        counts.append(n_labelled)
     outcomes = [
         Outcome(
             windows.run_id.astype(str),
@@ -114,7 +107,8 @@ def run(settings: Settings, progress: Progress = silent) -> LabelStudy:
 
 def _fold_labels(
     classifier: Any, examples: Examples, motion: Motion | None, fold: Fold, seed: int
-) -> _FoldLabels:
+) -> tuple[Array, tuple[int, ...]]:
+    """Return probabilities (strategies, n, k) of a fold's test rows, and how many runs were labelled for each."""
     rng = np.random.default_rng(seed)
     rows = fold.train
     truth = examples.terrain[rows]
@@ -148,7 +142,7 @@ def _fold_labels(
                 n_taken += 1
         found.append(_on(_fit(classifier, examples, rows, terrain, used), examples, fold.test))
         counts.append(len(np.unique(runs[known])) + n_taken)
-    return _FoldLabels(np.stack(found), tuple(counts))
+    return np.stack(found), tuple(counts)
 
 
 def _fit(classifier: Any, examples: Examples, rows: Array, terrain: Array, used: Array) -> Any:

@@ -93,17 +93,16 @@ def report(result: LongDrives) -> Report:
         max(getattr(drive, name) for drive in drives) for name in ("yaw_error_rad", "blind_yaw_error_rad")
     )
     columns = (
-        "terrain",
-        Column("yaw with a camera", ".4f", "rad"),
-        Column(f"after {LOST_S:g} s without", ".4f", "rad"),
+        *(
+            "terrain",
+            Column("yaw with a camera", ".4f", "rad"),
+            Column(f"after {LOST_S:g} s without", ".4f", "rad"),
+        ),
         Column("coverage of slip", ".3f"),
     )
     rows = tuple((d.terrain, d.yaw_error_rad, d.blind_yaw_error_rad, d.slip_coverage) for d in drives)
-    nees = tuple(
-        (GROUPS[key], float(np.mean([drive.nees[key] for drive in drives])), ".2f")
-        for key in GROUPS
-        if key in drives[0].nees
-    )
+    known = [key for key in GROUPS if key in drives[0].nees]
+    nees = tuple((GROUPS[key], float(np.mean([drive.nees[key] for drive in drives])), ".2f") for key in known)
     coverage = float(np.mean([drive.slip_coverage for drive in drives]))
     return Report(
         "Long drives",
