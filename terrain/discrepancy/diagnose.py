@@ -359,15 +359,25 @@ def reasons_to_withdraw(
     slow, slow_cov = info.fit(fit.names)
     reasons = {}
     for cause in significant:
-        constant, at = constancy_of_cause(fit, cause), fit.at(cause)
+        constant, at, main = constancy_of_cause(fit, cause), fit.at(cause), shown_channels(fit, cause)
+        reason = _at_bound(problem, fit, cause) or (constant.caveat if constant.varies else "")
+        if not reason:
+            # an input that explains much of its main channels beside it
+            gain = PROBE_RATIO * raw_gain(fit, cause)
+            for (channel, name), probe in probes.items():
+                alike = [probe.alike[p.name] for p in cause.parameters if p.name in probe.alike]
+                beside = channel in main and probe.significant and max(alike, default=1.0) > PROBE_ALIKE
+                if beside and probe.gain > gain:
+                    reason, gain = f"{channel} depends on {name} beside it (z {probe.z:.1f})", probe.gain
+        if not reason:
+            effects = channel_effects(fit, cause)
+            if not effects[main[0]][2] > 0:
+                reason = f"it gains nothing in {main[0]}, its main channel, on runs left out"
+            for name, (without, with_cause, _) in reversed(effects.items()):
+                if with_cause > WORSE_RATIO * without:
+                    reason = f"it makes {name} worse, by {with_cause / without - 1.0:.0%} of the square"
         size, var = fit.change[at], np.maximum(np.diag(slow_cov - fit.cov)[at], 0.0)
         least = SLOW_Z * np.sqrt(var * fit.tests[cause.name].inflation), SLOW_RATIO * np.linalg.norm(size)
-        reason = (
-            _at_bound(problem, fit, cause)
-            or (constant.caveat if constant.varies else "")
-            or _probed(fit, cause, probes)
-            or _worse(fit, cause)
-        )
         if not reason and ((size - slow[at]) * np.sign(size) > np.maximum(*least)).any():
             reason = "has a smaller value in slow motion: it fits noise of the wheel speeds"
         if reason:
@@ -382,28 +392,6 @@ def _at_bound(problem: Problem, fit: CauseFit, cause: Effect) -> str:
         above, below = [NEAR_BOUND * min(high - low, 2.0 * abs(bound)) for bound in (high, low)]
         if value > high - above or (low < 0.0 and value < low + below):
             return f"{p.label} ends at the bound of what it may be ({value:.3g} {p.unit})"
-    return ""
-
-
-def _probed(fit: CauseFit, cause: Effect, probes: Mapping[tuple[str, str], ProbeResult]) -> str:
-    """Return the input that explains much of the cause's main channels beside it."""
-    most, gain, main = "", PROBE_RATIO * raw_gain(fit, cause), shown_channels(fit, cause)
-    for (channel, name), probe in probes.items():
-        alike = [probe.alike[p.name] for p in cause.parameters if p.name in probe.alike]
-        beside = channel in main and probe.significant and max(alike, default=1.0) > PROBE_ALIKE
-        if beside and probe.gain > gain:
-            most, gain = f"{channel} depends on {name} beside it (z {probe.z:.1f})", probe.gain
-    return most
-
-
-def _worse(fit: CauseFit, cause: Effect) -> str:
-    """Return the channel that a cause makes worse, or its main channel if it gains nothing held out."""
-    effects, main = channel_effects(fit, cause), shown_channels(fit, cause)[0]
-    for name, (without, with_cause, _) in effects.items():
-        if with_cause > WORSE_RATIO * without:
-            return f"it makes {name} worse, by {with_cause / without - 1.0:.0%} of the square"
-    if not effects[main][2] > 0:
-        return f"it gains nothing in {main}, its main channel, on runs left out"
     return ""
 
 

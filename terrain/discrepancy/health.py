@@ -30,7 +30,6 @@ from terrain.discrepancy.clocks import (
     MIN_LAG_S,
     Latencies,
     Shift,
-    latencies_of,
     offsets_of,
     shifts_of,
 )
@@ -347,13 +346,12 @@ def faults_of(
     rows: Sequence[Rows],
     simulation: Simulation,
     low_pass: LowPass,
-    latencies: Latencies | None = None,
+    latencies: Latencies,
 ) -> tuple[Fault, ...]:
     """Return the faults of channels, in the order in which they are to be repaired: signs, units, offsets.
 
-    ``rows`` are those of the runs by the simulation; their clocks are measured where they are not known already.
+    ``rows`` are those of the runs by the simulation, ``latencies`` the lags of their channels.
     """
-    lags = latencies_of(signals, simulation) if latencies is None else latencies
     runs, logs, robot = list(signals), list(rows), simulation.robot
     ids, faults = [run.run_id for run in rows], []
 
@@ -371,7 +369,7 @@ def faults_of(
         faults.append(fault)
 
     def responses() -> tuple[Rows, ...]:
-        return on_own_clocks(logs, lags)
+        return on_own_clocks(logs, latencies)
 
     while len(faults) < MAX_FAULTS:
         before = agreement_of(responses())
@@ -379,7 +377,7 @@ def faults_of(
         def tried(change: Change, places: Sequence[int], before: Agreement = before) -> Reading:
             """Return what a change makes of the runs at some places."""
             after = Agreement(*(each.copy() for each in before))
-            own = agreement_of(on_own_clocks([without(change, i) for i in places], lags))
+            own = agreement_of(on_own_clocks([without(change, i) for i in places], latencies))
             for whole, part in zip(after, own, strict=True):
                 whole[list(places)] = part
             return reading_of(change, before, after)

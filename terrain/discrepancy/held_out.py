@@ -152,8 +152,18 @@ def gain_of_signals(
                 rms.append(float(np.sqrt(squares[-1].sum() / known)) if known else math.nan)
         reduction, ci = ratio_of_sums(squares[0] - squares[2], squares[0], seed)
         channels[name] = ChannelGain(rms[0], rms[2], rms[1], rms[3], reduction, ci, not ci[0] > 0.0)
-    costs = [_costs(info, n_parts) for info in infos]
-    reduction, ci = ratio_of_sums(costs[0] - costs[1], costs[0], seed)
+    costs: list[list[float]] = []  # what each cluster adds to minus twice the log-likelihood
+    for info in infos:
+        # its own scatter integrated out: of each third of a run, since parts of a common one need not be positive
+        prior = np.diag(1.0 / info.nuisance_std**2)
+        costs.append([])
+        for run in info.white:
+            for third in np.array_split(run[[*info.nuisances, -1]], n_parts, axis=1):
+                gram = np.einsum("qmc,pmc->qp", third, third)
+                shown = gram[:-1, -1]
+                costs[-1].append(float(gram[-1, -1] - shown @ np.linalg.solve(gram[:-1, :-1] + prior, shown)))
+    before, extended_costs = np.array(costs)
+    reduction, ci = ratio_of_sums(before - extended_costs, before, seed)
     ids, clusters = tuple([run.run_id for run in signals]), "runs" if n_parts == 1 else "thirds of runs"
     return Gain(ids, excluded, clusters, channels, reduction, ci, not ci[0] > 0.0)
 
@@ -181,21 +191,6 @@ def fit_to_judge(
             raise DataError(f"gain: none of {len(runs)} runs is fit to be compared ({excluded[0].reason})")
         info = evidence_at(signals, *about)
     return signals, tuple(excluded), info
-
-
-def _costs(info: Evidence, n_parts: int) -> Array:
-    """Return what each cluster (n,) adds to minus twice the log-likelihood, its own scatter integrated out.
-
-    Each third of a run has a scatter of its own, since parts of a common one need not be positive.
-    """
-    prior = np.diag(1.0 / info.nuisance_std**2)
-    costs = []
-    for white in info.white:
-        for part in np.array_split(white[[*info.nuisances, -1]], n_parts, axis=1):
-            gram = np.einsum("qmc,pmc->qp", part, part)
-            shown = gram[:-1, -1]
-            costs.append(float(gram[-1, -1] - shown @ np.linalg.solve(gram[:-1, :-1] + prior, shown)))
-    return np.array(costs)
 
 
 # -- What an extension gains for the robot's filter, against the truth of runs that have one ---------------

@@ -77,7 +77,7 @@ def rows_and_low_pass(signals, simulation):
 def faults(signals, name="husky"):
     simulation = simulation_of(load_robot(name))
     rows, low_pass = rows_and_low_pass(signals, simulation)
-    return faults_of(signals, rows, simulation, low_pass)
+    return faults_of(signals, rows, simulation, low_pass, latencies_of(signals, simulation))
 
 
 def edit(change, **starts):
@@ -262,7 +262,8 @@ def test_one_run_alone_and_a_run_without_rows_are_no_special_case():
     (run,), simulation = on_one_clock(sound()[1:2]), simulation_of(HUSKY)
     (rows,), low_pass = rows_and_low_pass([run], simulation)
     none = {name: getattr(rows, name)[:0] for name in ("time_s", "measured", "predicted", "inputs")}
-    assert faults_of([run], [rows._replace(**none)], simulation, low_pass) == ()
+    lags = latencies_of([run], simulation)
+    assert faults_of([run], [rows._replace(**none)], simulation, low_pass, lags) == ()
     unclear = fault._replace(change=fault.change._replace(factor=float("nan")))  # the channel is left out
     (left,) = repaired([run], [unclear])
     assert np.isnan(left.measured[:, G]).all()
