@@ -94,56 +94,59 @@ LEFT = (
 )
 
 
-FINDINGS = (
-    ({"gain": a_gain(refused=True)}, ("no gain can be claimed", "no gain to claim")),
-    ({"gain": a_gain(refused=True, high=-0.05)}, (" worse ",)),
-    (
-        {"gain": replace(a_gain(filter=FILTER, classifier=CLASSIFIER), black_box=REFERENCE)},
+@pytest.mark.parametrize(
+    ("findings", "stated"),
+    [
+        ({"gain": a_gain(refused=True)}, ("no gain can be claimed", "no gain to claim")),
+        ({"gain": a_gain(refused=True, high=-0.05)}, (" worse ",)),
         (
-            "speed ahead m/s 0.02 0.01 75.0 % 70.0 to 80.0 % 76.0 %",
-            "reference 76 %: little is left to find.",
-            "speed, root mean square m/s 0.1 0.05 -0.06 to -0.04",
-            f"accuracy 0.8 0.9 {NOT_KNOWN}",
+            {"gain": replace(a_gain(filter=FILTER, classifier=CLASSIFIER), black_box=REFERENCE)},
+            (
+                "speed ahead m/s 0.02 0.01 75.0 % 70.0 to 80.0 % 76.0 %",
+                "reference 76 %: little is left to find.",
+                "speed, root mean square m/s 0.1 0.05 -0.06 to -0.04",
+                f"accuracy 0.8 0.9 {NOT_KNOWN}",
+            ),
         ),
-    ),
-    ({"gain": a_gain(filter=Comparison("vio12", "no camera", 2, {}))}, ("vio12 is not measured: no camera",)),
-    (
-        {"ambiguous_sets": (tuple(RIVALS),), "ambiguous_values": RIVALS},
         (
-            "One of payload or motor constant is present, and these runs cannot distinguish them.",
-            "20 % (10 to 30 %) accelerations and slopes; speed ahead distinguishes it from motor constant",
+            {"gain": a_gain(filter=Comparison("vio12", "no camera", 2, {}))},
+            ("vio12 is not measured: no camera",),
         ),
-    ),
-    (
-        {"not_excited": LIMITS[1:3], "unexplained": LEFT, "varying": (PAYLOAD,)},
         (
-            "depends on wheel 1 turn 12.3 20.0 %",
-            "Of 4 parameters that may be wrong, 2 could not have been detected.",
-            "A payload of any size would not have been detected.",
-            "A clock rate of any size that is likely (up to 2 %) would not have been detected.",
-            "An effective track off by under 4.8 % would not have been detected.",
-            "scrub The runs show nothing of it. 0.4",
-            "10 % on average, with a standard deviation of 14 %. Two groups: 0 % in 2 runs (a, b), and 30 % in 6 "
-            "runs (c, d, e, f, g, ...). These runs do not distinguish that from scrub.",
+            {"ambiguous_sets": (tuple(RIVALS),), "ambiguous_values": RIVALS},
+            (
+                "One of payload or motor constant is present, and these runs cannot distinguish them.",
+                "20 % (10 to 30 %) accelerations and slopes; speed ahead distinguishes it from motor constant",
+            ),
         ),
-    ),
-    (
-        {
-            "clocks": (Clock("r3", 0.0123, 0.001), Clock("r4", np.nan, np.inf)),
-            "excluded_runs": (Excluded("r<9>", "its gyro stands still"),),
-            "next_drive": verdict.NextDrive("climb", 6.0, "it parts them"),
-        },
         (
-            f"r3 0.0123 0.0010 r4 {NOT_KNOWN}",
-            "excluded as unfit: r<9>.",
-            "r<9> its gyro stands still",
-            "Scenario climb, on a slope of 6°: it parts",
+            {"not_excited": LIMITS[1:3], "unexplained": LEFT, "varying": (PAYLOAD,)},
+            (
+                "depends on wheel 1 turn 12.3 20.0 %",
+                "Of 4 parameters that may be wrong, 2 could not have been detected.",
+                "A payload of any size would not have been detected.",
+                "A clock rate of any size that is likely (up to 2 %) would not have been detected.",
+                "An effective track off by under 4.8 % would not have been detected.",
+                "scrub The runs show nothing of it. 0.4",
+                "10 % on average, with a standard deviation of 14 %. Two groups: 0 % in 2 runs (a, b), and 30 % in 6 "
+                "runs (c, d, e, f, g, ...). These runs do not distinguish that from scrub.",
+            ),
         ),
-    ),
+        (
+            {
+                "clocks": (Clock("r3", 0.0123, 0.001), Clock("r4", np.nan, np.inf)),
+                "excluded_runs": (Excluded("r<9>", "its gyro stands still"),),
+                "next_drive": verdict.NextDrive("climb", 6.0, "it parts them"),
+            },
+            (
+                f"r3 0.0123 0.0010 r4 {NOT_KNOWN}",
+                "excluded as unfit: r<9>.",
+                "r<9> its gyro stands still",
+                "Scenario climb, on a slope of 6°: it parts",
+            ),
+        ),
+    ],
 )
-
-
-@pytest.mark.parametrize(("findings", "stated"), FINDINGS)
 def test_what_was_found_is_stated_with_its_numbers(explained, findings, stated):
     text = text_of(explained(**findings))
     assert [each for each in stated if each not in text] == []

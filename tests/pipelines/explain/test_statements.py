@@ -70,29 +70,25 @@ def sentence(runs, gain=None, **more):
     return statement.text
 
 
-@pytest.mark.parametrize("factor", [0.1, 0.4, 0.9, 1.3, -0.97])
-def test_the_factor_comes_back_within_its_error_although_some_runs_are_stalled(factor):
-    runs = runs_of(20, factor)
-    slope = slopes_of(runs)[YAW]
-    assert abs(slope.ratio - factor) < 4 * max(slope.std, 0.002)
-    stalled = [run._replace(measured=0.0 * run.measured) for run in runs[:2]]
-    assert slopes_of([*runs, *stalled])[YAW].ratio == pytest.approx(factor, abs=0.03)
-
-
-def test_a_slope_scales_with_what_is_measured_and_is_the_least_of_absolute_deviations():
+def test_the_factor_or_level_comes_back_within_its_error_although_some_runs_are_stalled():
+    for factor in (0.1, 0.4, 0.9, 1.3, -0.97):
+        runs = runs_of(20, factor)
+        slope = slopes_of(runs)[YAW]
+        assert abs(slope.ratio - factor) < 4 * max(slope.std, 0.002)
+        stalled = [run._replace(measured=0.0 * run.measured) for run in runs[:2]]
+        assert slopes_of([*runs, *stalled])[YAW].ratio == pytest.approx(factor, abs=0.03)
+    # the slope scales with what is measured, and is that of the least sum of absolute deviations
     x, y = np.random.default_rng(3).standard_normal((2, 101))
-    slope = slope_through_zero(x, y)
-    assert slope_through_zero(x, -2.0 * y) == pytest.approx(-2.0 * slope)
+    least = slope_through_zero(x, y)
+    assert slope_through_zero(x, -2.0 * y) == pytest.approx(-2.0 * least)
     grid = np.linspace(-3.0, 3.0, 6001)
-    assert np.abs(y - slope * x).sum() <= np.abs(y - grid[:, None] * x).sum(axis=1).min() + 1e-9
+    assert np.abs(y - least * x).sum() <= np.abs(y - grid[:, None] * x).sum(axis=1).min() + 1e-9
     assert math.isnan(slope_through_zero(np.zeros(3), y[:3]))
-
-
-@pytest.mark.parametrize("level", [2.0, 0.0])
-def test_a_level_is_no_factor_and_what_agrees_has_neither(level):
-    slope = slopes_of(runs_of(6, level=level, std=0.1))[YAW]
-    assert math.isnan(slope.ratio)
-    assert slope.level == pytest.approx(level or math.nan, abs=0.03, nan_ok=True)
+    # a level is no factor, and what agrees has neither
+    for level in (2.0, 0.0):
+        slope = slopes_of(runs_of(6, level=level, std=0.1))[YAW]
+        assert math.isnan(slope.ratio)
+        assert slope.level == pytest.approx(level or math.nan, abs=0.03, nan_ok=True)
 
 
 def test_a_channel_states_factor_cause_in_the_robots_quantities_and_its_error_on_held_out_runs():
@@ -163,19 +159,16 @@ def test_what_was_found_of_a_channel_is_stated(runs, findings, stated):
     assert sentence(runs, **findings).endswith(stated)
 
 
-@pytest.mark.parametrize(
-    ("channel", "slope", "text"),
-    [
+def test_factors_and_levels_in_words():
+    for channel, slope, text in (
         (YAW, Slope(0.02, 0.001), "the simulation turns more than 20 times too fast"),
         (YAW, Slope(-0.97, 0.01), "the simulation turns backward"),
         ("accel_x_mps2", Slope(-1.0, 0.01), "simulated, it is of the wrong sign"),
         ("speed_x_mps", Slope(2.0, 0.1), "the simulation drives 2 times too slowly"),
         ("speed_x_mps", Slope(level=-0.05), "the simulation is 0.05 m/s too fast throughout"),
         (YAW, Slope(level=0.01), "measured is 0.01 rad/s more to the left throughout"),
-    ],
-)
-def test_factors_and_levels_in_words(channel, slope, text):
-    assert off_by(channel, slope.ratio, slope.level) == text
+    ):
+        assert off_by(channel, slope.ratio, slope.level) == text
 
 
 def test_only_the_sum_of_a_described_lever_and_the_one_found_counts():
@@ -196,7 +189,7 @@ def test_only_the_sum_of_a_described_lever_and_the_one_found_counts():
     )
 
 
-def test_terrains_are_compared_where_runs_differ_only():
+def test_terrains_that_differ_or_are_bumpy_are_named_where_runs_differ_only():
     runs = [a_run(i, 0.6 - 0.1 * (i > 4), terrain="sand" if i > 4 else "asphalt") for i in range(10)]
     doubtful = a_diagnosis(causes=(TRACK._replace(caveat="it differs from run to run by 0.3 ratio"),))
     apart = terrains_apart(doubtful, runs)
@@ -204,6 +197,11 @@ def test_terrains_are_compared_where_runs_differ_only():
     assert terrains_apart(a_diagnosis(causes=(TRACK,)), runs) == {}
     alike = [run._replace(terrain="ab"[i % 2]) for i, run in enumerate(runs[:5])]
     assert terrains_apart(doubtful, alike) == {}
+    first, second = notes_of(a_diagnosis(), [TerrainMatch("gravel", "gravel", 0.25)], apart)
+    assert "25 % of the measured tilt" in first
+    assert "measured over simulated is 0.60 on asphalt and 0.50 on sand." in second
+    assert "Explain each by itself with --terrain asphalt or --terrain sand." in second
+    assert notes_of(a_diagnosis(), [TerrainMatch("grass", "grass", 1.0)], {}) == ()
 
 
 def test_what_could_not_have_been_seen_is_not_ruled_out():
@@ -211,12 +209,3 @@ def test_what_could_not_have_been_seen_is_not_ruled_out():
     effects = (LATE, RuledOut("payload", "no", 0.0), RuledOut("gyro_bias", "no", 0.0))
     withdrawn, seen = split_ruled_out(a_diagnosis(ruled_out=effects, not_excited=(missed,)))
     assert [effect.name for effect in (*withdrawn, *seen)] == ["clock_offset", "gyro_bias"]
-
-
-def test_terrains_that_differ_or_are_bumpy_are_named():
-    apart = {"ice": Slope(0.4, 0.01), "snow": Slope(0.5, 0.01)}
-    first, second = notes_of(a_diagnosis(), [TerrainMatch("gravel", "gravel", 0.25)], apart)
-    assert "25 % of the measured tilt" in first
-    assert "measured over simulated is 0.40 on ice and 0.50 on snow." in second
-    assert "Explain each by itself with --terrain ice or --terrain snow." in second
-    assert notes_of(a_diagnosis(), [TerrainMatch("grass", "grass", 1.0)], {}) == ()

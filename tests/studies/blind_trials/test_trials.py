@@ -32,6 +32,8 @@ from studies.blind_trials.trial import (
     TRACK_SCATTER,
     WHEELS_LATE_S,
     Case,
+    Draw,
+    Hidden,
     Row,
     as_command_log,
     cases_of,
@@ -201,17 +203,15 @@ def test_stalled_runs_do_not_move_and_their_wheels_turn(number):
         assert speed < 2 * CREEP_RATIO[1] * driven + 0.02 if is_stalled else speed > 0.25 * driven
 
 
-@pytest.mark.slow
-def test_half_of_the_runs_have_the_effect_and_the_others_have_none():
-    numbers = range(1, 99, 2)
-    made = next(s for n in numbers if (s := stage(Row.HALF, n)).hidden.causes == ("gyro_bias",))
-    (bias,), present = made.hidden.effects.values(), made.asked["present"]
+def test_half_of_the_runs_have_the_effect_and_the_others_have_none(monkeypatch):
+    made = stage(Row.HALF, 1)
+    present = made.asked["present"]
     assert len(present) == len(made.runs) // 2
-    for run in made.runs:
-        imu = run.streams["imu"]
-        at_rest = float(gyro(imu)[imu.time_s < 1.0].mean())
-        assert at_rest == pytest.approx(bias if run.run_id in present else 0.0, abs=0.008)
-    assert abs(bias) > 0.008
+    monkeypatch.setattr(Draw, "strong", lambda *_, **__: Hidden(()))
+    for run, plain in zip(made.runs, staged(Row.HALF, 1).runs, strict=True):
+        pairs = [(stream, plain.streams[name]) for name, stream in run.streams.items()]
+        alike = [np.array_equal(a.values, b.values) and np.array_equal(a.time_s, b.time_s) for a, b in pairs]
+        assert all(alike) == (run.run_id not in present)
 
 
 def test_a_larger_wheel_carries_the_dynamic_robot_further():
