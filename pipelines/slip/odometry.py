@@ -67,13 +67,11 @@ def calibrate(settings: Settings, progress: Progress) -> OdometryResult:
     if settings.data.is_dir() and any((path / FILE_NAME).is_file() for path in find_sessions(settings.data)):
         windows = read_window_poses(settings.data, drive_robot(robot))
     asked = settings.lengths, settings.folds, settings.seed
-    found = judge_odometry(runs, windows, robot, *asked, partial(progress, "odometry"))
-    values = found._asdict()
-    model, flat = values.pop("model"), values.pop("flat")
+    model, flat, figures = judge_odometry(runs, windows, robot, *asked, partial(progress, "odometry"))
     if settings.out is not None:
         write_slip_model(settings.out, model, robot.name)
     notes = (FLAT,) if flat else ()
-    return OdometryResult.of(settings, **values, robot=robot.name, written=settings.out, notes=notes)
+    return OdometryResult.of(settings, **figures, robot=robot.name, written=settings.out, notes=notes)
 
 
 KINDS = (

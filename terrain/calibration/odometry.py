@@ -27,7 +27,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -432,22 +432,6 @@ class ParameterFound:
     high: float
 
 
-class JudgedOdometry(NamedTuple):
-    """What kinds of odometry are worth, and the slip model."""
-
-    n_runs: int  #: runs with poses
-    scores: tuple[LegScores, ...]  #: by length of the legs
-    model: SlipModel  #: slip model of slip-compensated odometry, fitted to all runs
-    parameters: Mapping[str, ParameterFound]  #: of that
-    #: where the point that poses show lies in the body, and by which the sensor of the poses is turned
-    observed_point_m: tuple[float, float]
-    observed_angle_rad: float
-    #: scores of the last windows of commands, by the adaptive observer and others; None without
-    adaptive: LegScores | None
-    delay_s: float  #: of the poses behind the gyro
-    flat: bool  #: whether no slope was driven, or no tilt measured, so that what slopes do is not fitted
-
-
 def judge_odometry(
     runs: Sequence[RunLog],
     windows: Mapping[str, tuple[WindowPoses, ...]],
@@ -456,8 +440,14 @@ def judge_odometry(
     folds: int,
     seed: int,
     count: Callable[[int, int], None] = lambda done, total: None,
-) -> JudgedOdometry:
+) -> tuple[SlipModel, bool, dict[str, Any]]:
     """Fit kinds of odometry to folds of whole runs, judge them on the others, and fit the slip model to all.
+
+    Returned are the slip model of slip-compensated odometry fitted to all runs, whether no slope was driven or no tilt
+    measured, so that what slopes do is not fitted, and the figures by name: ``n_runs`` with poses, ``scores`` by length
+    of the legs, ``parameters`` of the model, ``observed_point_m`` and ``observed_angle_rad`` of the sensor of the poses
+    in the body, ``adaptive`` scores of the last windows of commands (None without), and ``delay_s`` of the poses behind
+    the gyro.
 
     Runs have poses, compared after some lengths, or are commands of DRIVE with the poses of their windows by run.
     ``DataError`` if fewer runs than folds have poses.
@@ -515,8 +505,16 @@ def judge_odometry(
     x_m, y_m, angle_rad = map(float, fitted.mount)
     rows = zip(fitted.fit.parameters, fitted.fit.value.tolist(), *fitted.fit.interval.tolist(), strict=True)
     found = {p.name: ParameterFound(*row) for p, *row in rows if p.name in PARAMETERS}
-    n_runs = len({leg.run for leg in every})
-    return JudgedOdometry(n_runs, scores, fitted.model, found, (x_m, y_m), angle_rad, adaptive, delay_s, flat)
+    figures = {
+        "n_runs": len({leg.run for leg in every}),
+        "scores": scores,
+        "parameters": found,
+        "observed_point_m": (x_m, y_m),
+        "observed_angle_rad": angle_rad,
+        "adaptive": adaptive,
+        "delay_s": delay_s,
+    }
+    return fitted.model, flat, figures
 
 
 def efficiencies_before(

@@ -52,8 +52,17 @@ def replay(run: RunLog, rate_hz: float = 50.0) -> Iterator[Sample]:
     """
     if not 0 < rate_hz < np.inf:
         raise ConfigError(f"rate_hz is {rate_hz:g}, a rate above zero is required")
-    came = {name: _came(run.streams[name].time_s) for name in SENSORS if name in run.streams}
-    came = {name: time_s for name, time_s in came.items() if time_s.size}
+    came: dict[
+        str, Array
+    ] = {}  # when each sample came: by its stamp, or with the next in order, or with the last
+    for name in SENSORS:
+        time_s = run.streams[name].time_s if name in run.streams else np.empty(0)
+        known = np.flatnonzero(np.isfinite(time_s))
+        rising = known[longest_rise(time_s[known])]
+        if rising.size:
+            in_order = np.full(time_s.size, time_s[rising[-1]])
+            in_order[rising] = time_s[rising]
+            came[name] = np.minimum.accumulate(in_order[::-1])[::-1]
     if not came:
         raise DataError(f"run {run.run_id}: there is no sensor to replay, none of {', '.join(SENSORS)}")
     span_s = max(c[-1] for c in came.values()) - min(c[0] for c in came.values())
@@ -70,7 +79,11 @@ def _steps(run: RunLog, came: dict[str, Array], step_s: float) -> Iterator[Sampl
     end_s = float(max(c[-1] for c in came.values()))
     ticks = start_s + step_s * np.arange(np.ceil((end_s - start_s - _SLACK_S) / step_s) + 1)
     ends = {name: np.searchsorted(c, ticks + _SLACK_S, side="right") for name, c in came.items()}
-    twists = _twists(run, ticks)
+    twists, commands = np.zeros((ticks.size, 3)), run.streams.get("commands")
+    if commands is not None and set(TWIST) <= set(commands.channels):
+        desired = commands.columns(TWIST)
+        last = np.searchsorted(commands.time_s, ticks + _SLACK_S, side="right") - 1
+        twists[last >= 0] = desired[last[last >= 0]]
     channels = {name: run.streams[name].channels for name in came}
     for k, tick_s in enumerate(ticks.tolist()):
         readings = {}
@@ -81,26 +94,3 @@ def _steps(run: RunLog, came: dict[str, Array], step_s: float) -> Iterator[Sampl
                 readings[name] = Reading(stream.time_s[part], stream.values[part])
         terrain = next((label.terrain for label in run.labels if label.start_s <= tick_s < label.end_s), "")
         yield Sample(tick_s, twists[k], NamedReadings(readings, channels), terrain)
-
-
-def _came(time_s: Array) -> Array:
-    """Return when each sample (n,) came: by its stamp, or with the next in order, or with the last."""
-    known = np.flatnonzero(np.isfinite(time_s))
-    rising = known[longest_rise(time_s[known])]
-    if not rising.size:
-        return np.empty(0)
-    came = np.full(time_s.size, time_s[rising[-1]])
-    came[rising] = time_s[rising]
-    return np.minimum.accumulate(came[::-1])[::-1]
-
-
-def _twists(run: RunLog, ticks: Array) -> Array:
-    """Return the twist (n, 3) desired at each tick."""
-    twists = np.zeros((ticks.size, 3))
-    commands = run.streams.get("commands")
-    if commands is None or not set(TWIST) <= set(commands.channels):
-        return twists
-    desired = commands.columns(TWIST)
-    last = np.searchsorted(commands.time_s, ticks + _SLACK_S, side="right") - 1
-    twists[last >= 0] = desired[last[last >= 0]]
-    return twists

@@ -92,24 +92,19 @@ _MOTORS_ONLY = "dc_motor"
 _MAX_DEPTH = 3  # folders from a run's file up to that of the camera
 
 
-def find_root(folder: Path) -> Path | None:
-    """Return the folder of the data set that a folder is or lies in; None where there is none."""
-    folder = folder.resolve()
-    places = (folder, *folder.parents[:_MAX_DEPTH])
-    return next((place for place in places if (place / CAMERA_FILE).is_file()), None)
-
-
 def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
     """Return one reader per run in ``folder``, a data set or a folder of it; call it with ``repair=``.
 
     The list is empty where there is no ``camera_params.json`` in the folder or above it, or no run.
     """
-    root = find_root(folder)
+    whole = folder.resolve()
+    places = (whole, *whole.parents[:_MAX_DEPTH])
+    root = next((place for place in places if (place / CAMERA_FILE).is_file()), None)
     if root is None:
         return []
     files = sorted(
         path
-        for path in folder.resolve().rglob("*.csv.gz")
+        for path in whole.rglob("*.csv.gz")
         if not path.name.endswith("_load.csv.gz")
         and not any(part.startswith(".") for part in path.relative_to(root).parts)
     )
@@ -155,7 +150,14 @@ def read_run(path: Path, root: Path, *, repair: bool = False) -> RunLog:
                 "of another robot or session?)"
             )
         streams["commands"] = checked(time_s, twist, TWIST, columns=_TWIST)
-        metres = read_camera(root)
+        camera, metres = root / CAMERA_FILE, []  # a pixel, in x and y
+        document = read_json(check_log_file(camera, root), short_name(camera), LogError)
+        for key in ("pixel_resolution_x", "pixel_resolution_y"):
+            value = document.get(key) if isinstance(document, dict) else None
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < np.inf:
+                fault = f"{key} is {shown(value)}, millimetres a pixel are required"
+                raise LogError(f"{short_name(camera)}: {fault}")
+            metres.append(float(value) * 1e-3)
         new = np.asarray(np.isfinite(seen).all(axis=1))
         new[1:] &= (np.diff(seen, axis=0) != 0.0).any(axis=1)
         moves = any(np.ptp(count[np.isfinite(count)]) >= MIN_TICKS for count in counts.T)
@@ -171,23 +173,6 @@ def read_run(path: Path, root: Path, *, repair: bool = False) -> RunLog:
     labels = (whole_run_label({"wheels": streams["wheels"]}, terrain),) if terrain else ()
     source, dropped = f"{'/'.join(parts)}, Robotino layout", converted + (repairs or Counter())
     return checked_names(name, RunLog(run_id, "robotino", streams, labels, source, dropped, session))
-
-
-def read_camera(root: Path) -> list[float]:
-    """Return the metres a pixel, in x and y, of the camera of a data set.
-
-    ``LogError`` where the file is missing, no JSON, or lacks a scale above zero.
-    """
-    path = root / CAMERA_FILE
-    place = short_name(path)
-    document = read_json(check_log_file(path, root), place, LogError)
-    scales = []
-    for key in ("pixel_resolution_x", "pixel_resolution_y"):
-        value = document.get(key) if isinstance(document, dict) else None
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < np.inf:
-            raise LogError(f"{place}: {key} is {shown(value)}, millimetres a pixel are required")
-        scales.append(float(value) * 1e-3)
-    return scales
 
 
 def _scale(time_s: Array, rate_radps: Array, counts: Array) -> float:

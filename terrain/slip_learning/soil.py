@@ -686,13 +686,6 @@ class LawRow(NamedTuple):
     angle: HeldOut
 
 
-class Checked(NamedTuple):
-    """Errors of the last law, fitted to all trials, on further ones: sinkage predicted, and measured."""
-
-    load: Misfit
-    sinkage: Misfit
-
-
 class SoilFile(NamedTuple):
     """The soil that the simulator takes."""
 
@@ -725,7 +718,8 @@ class WheelResult:
     #: surrogate_slip, surrogate_angle: errors of a polynomial of slip and angle, for reference
     surrogate_slip: Misfit
     surrogate_angle: Misfit
-    checked: Checked | None  #: on the trials of ``--check``; None without any
+    #: errors of the last law, fitted to all trials, on those of ``--check``, by what is given; None without any
+    checked: Mapping[str, Misfit] | None
     not_identified: tuple[str, ...]  #: a sentence for each thing that these trials cannot say
     soil: SoilFile  #: that was written for the simulator
 
@@ -740,7 +734,8 @@ class WheelResult:
                 f"{held} left out, traction and side force off by {found.load.forces} of the load: {state}"
             )
         if self.checked is not None:
-            parts.append(f"{self.checked.load.n_trials} further trials: {self.checked.load.forces}")
+            load = self.checked["load"]
+            parts.append(f"{load.n_trials} further trials: {load.forces}")
         return f"{self.wheel}: {100.0 * BAR_RATIO:.0f} % aimed at; {'; '.join(parts)}."
 
 
@@ -823,7 +818,7 @@ def compare_laws(
     fit = fit_law(law, means, wheel)
     if further is not None:
         further = without_coupling(further, coupling)
-        checked = Checked(*(misfit(further, predict(fit, further, given)) for given in GIVEN))
+        checked = {given: misfit(further, predict(fit, further, given)) for given in GIVEN}
     parameters = parameters_of(fit, means, draws, seed, count)
     cohesion = tuple(cohesion_profile(law, means, wheel, COHESIONS_PA))
     modulus, angle_rad = modulus_spread(fit, trials), math.atan(parameters["tan_friction"].value)
