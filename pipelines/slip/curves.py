@@ -212,8 +212,8 @@ def curve_panel(entry: LearnedTerrain) -> Panel:
         law, ratio = curve.thrust_ratio, curve.resistance_ratio
         points = [("peak of net traction, or 95 % of it", curve.peak.slip_ratio, 1)]
         if (targets := entry.targets) is not None:
-            points.append(("target, traction", targets.of("traction").slip_ratio, 2))
-            points.append(("target, steady", targets.of("steady").slip_ratio, 3))
+            points.append(("target, traction", targets["traction"].slip_ratio, 2))
+            points.append(("target, steady", targets["steady"].slip_ratio, 3))
         marks += law_marks(law, curve.slip_range, curve.peak_interval, ratio)
         marks.append(Band("90 % over runs", slips, low, high, 0))
         for label, at, colour in points:

@@ -9,7 +9,7 @@ or no robot would start.  What such a target of one session costs in another ses
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from statistics import median_low
 from typing import Any, NamedTuple
 
@@ -23,8 +23,9 @@ from terrain.simulation.run import learning_runs
 from terrain.slip_learning.curve import (
     LAW_PARAMETERS,
     MIN_ABOVE_BALANCE_SLIP,
+    PEAK_SLIP_RATIO,
     SlipCurve,
-    Targets,
+    TargetSlip,
     energy_jpm,
     tractive_efficiency,
 )
@@ -76,7 +77,7 @@ def learned_table(learned: Sequence[LearnedTerrain], robot: Robot, name: str) ->
             continue
         curves[terrain], numbers = curve_entry(curve, entry.targets, robot), {}
         for state in DRIVE_STATES:
-            slip, std, source = entry.targets.of(state)
+            slip, std, source = entry.targets[state]
             rounded = round(slip, DIGITS), round(std, DIGITS), curve.n_runs
             numbers[state] = SlipTarget(terrain, state, *rounded, TargetStatus.ESTIMATED, source)
         targets[terrain] = numbers
@@ -108,14 +109,14 @@ def _assumed(terrain: str, status: TargetStatus = TargetStatus.UNESTIMATED) -> d
     }
 
 
-def curve_entry(curve: SlipCurve, targets: Targets, robot: Robot) -> CurveEntry:
+def curve_entry(curve: SlipCurve, targets: Mapping[str, TargetSlip], robot: Robot) -> CurveEntry:
     """Return what the table holds of a curve, rounded."""
     energy = {
-        f"{state}_energy_jpm": round(energy_jpm(curve, targets.of(state).slip_ratio, robot), 1)
+        f"{state}_energy_jpm": round(energy_jpm(curve, targets[state].slip_ratio, robot), 1)
         for state in DRIVE_STATES
     }
     named = zip(LAW_PARAMETERS[curve.law], curve.parameters, strict=True)
-    working = targets.working_slip_ratio
+    working = curve.working_slip_ratio
     return CurveEntry(
         law=curve.law,
         parameters={name: round(value, DIGITS + 1) for name, value in named},
@@ -126,9 +127,9 @@ def curve_entry(curve: SlipCurve, targets: Targets, robot: Robot) -> CurveEntry:
         resistance_ratio=round(curve.resistance_ratio, DIGITS),
         resistance_std=round(curve.resistance_std, DIGITS),
         balance_slip_ratio=round(curve.balance_slip_ratio, DIGITS),
-        peak_based_slip_ratio=round(targets.peak_based_slip_ratio, DIGITS),
+        peak_based_slip_ratio=round(PEAK_SLIP_RATIO * curve.peak.slip_ratio, DIGITS),
         working_slip_ratio=None if math.isnan(working) else round(working, DIGITS),
-        traction_efficiency_ratio=round(tractive_efficiency(curve, targets.traction.slip_ratio), 3),
+        traction_efficiency_ratio=round(tractive_efficiency(curve, targets["traction"].slip_ratio), 3),
         **energy,
         n_runs=curve.n_runs,
     )

@@ -539,27 +539,8 @@ class TargetSlip(NamedTuple):
     source: str
 
 
-class Targets(NamedTuple):
-    """Targets of a terrain, and the two slips of which that of traction is the lesser.
-
-    ``peak_based_slip_ratio`` is :data:`PEAK_SLIP_RATIO` of the peak slip, ``working_slip_ratio`` the slip
-    with the net traction of a start.
-    """
-
-    traction: TargetSlip
-    braking: TargetSlip
-    steady: TargetSlip
-    peak_based_slip_ratio: float
-    working_slip_ratio: float
-
-    def of(self, drive_state: str) -> TargetSlip:
-        """Return the target of ``traction``, ``braking`` or ``steady``."""
-        target: TargetSlip = getattr(self, drive_state)
-        return target
-
-
-def targets_of(curve: SlipCurve) -> Targets:
-    """Return the targets of a terrain: braking <= 0 <= steady <= traction.
+def targets_of(curve: SlipCurve) -> dict[str, TargetSlip]:
+    """Return the targets of a terrain by drive state: braking <= 0 <= steady <= traction.
 
     Traction is near the peak, but not beyond what a start requires, as more slip only costs energy, and at least
     :data:`MIN_ABOVE_BALANCE_SLIP` above steady motion.  Braking is the peak slip mirrored; where there is no peak, at
@@ -584,7 +565,7 @@ def targets_of(curve: SlipCurve) -> Targets:
         braking = TargetSlip(
             -BRAKING_CAP_SLIP, SYSTEMATIC_SLIP_STD, f"capped: thrust rises monotonically; {n}"
         )
-    return Targets(traction, braking, steady, PEAK_SLIP_RATIO * slip, curve.working_slip_ratio)
+    return {"traction": traction, "braking": braking, "steady": steady}
 
 
 def tractive_efficiency(curve: SlipCurve, slip_ratio: float) -> float:

@@ -16,7 +16,7 @@ from terrain.records import RunLog, TargetStatus
 from terrain.robots import Robot
 from terrain.slip_learning.curve import (
     SlipCurve,
-    Targets,
+    TargetSlip,
     contradiction,
     insufficiency,
     learn_curve,
@@ -59,7 +59,9 @@ class LearnedTerrain:
     status: TargetStatus  #: whether the targets are learned
     reason: str = ""  #: why ``curve`` or ``targets`` are None; empty otherwise
     curve: SlipCurve | None = None  #: None where the runs do not suffice for one
-    targets: Targets | None = None  #: None without a curve, or where the curve contradicts itself
+    targets: Mapping[str, TargetSlip] | None = (
+        None  #: None without a curve, or where the curve contradicts itself
+    )
 
     @property
     def runs_with_bins(self) -> tuple[TerrainRun, ...]:

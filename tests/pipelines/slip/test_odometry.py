@@ -42,7 +42,7 @@ def test_slip_that_is_known_gains_and_its_model_is_a_file(turns, tmp_path):
 
 @pytest.mark.slow
 def test_commands_of_the_measured_marmotte_held_out(measured):
-    result = judged(measured("drive_marmotte"), robot="marmotte", folds=5)
+    result = judged(measured("drive_marmotte"), robot="marmotte", folds=3)
     assert [round(scores.length_s) for scores in result.scores] == [2, 6]
     for scores, least in zip(result.scores, (0.15, 0.3), strict=True):
         kinds = {kind.kind: kind for kind in scores.kinds}

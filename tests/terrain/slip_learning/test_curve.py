@@ -138,8 +138,8 @@ def test_targets_rise_and_have_the_traction_they_are_chosen_for(law, theta, rho)
     runs = drawn_runs(law, theta, rng, noise=0.003, run_std=0.02)
     curve = learn_curve(runs, *resistances_of(len(runs), rho), rng, n_bootstrap=8)
     targets, robot = targets_of(curve), load_robot("agrimaro")
-    steady, traction = targets.steady.slip_ratio, targets.traction.slip_ratio
-    assert -BRAKING_CAP_SLIP <= targets.braking.slip_ratio < 0 <= steady < traction or law == "magic"
+    steady, traction = targets["steady"].slip_ratio, targets["traction"].slip_ratio
+    assert -BRAKING_CAP_SLIP <= targets["braking"].slip_ratio < 0 <= steady < traction or law == "magic"
     f = traction_ratio(curve.law, curve.parameters, np.array([steady, traction]))
     assert f[0] == pytest.approx(curve.resistance_ratio, abs=1e-3)
     assert traction >= steady + MIN_ABOVE_BALANCE_SLIP - 1e-9
