@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import functools
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "papers"))
-
 from car_scenarios import STOP, Course, slope_course, stop_course
 
 from terrain.control.car_following import (

@@ -7,23 +7,19 @@ import runpy
 import sys
 from pathlib import Path
 
+import claims
+import danzi
+import deremetz
 import pytest
+import tazzari
+import yamauchi
 
-FOLDER = Path(__file__).parents[2] / "examples" / "papers"
-sys.path.insert(0, str(FOLDER))
+from pipelines.report.pages import html_page
+from terrain.control.car_following import SlipSource
+from terrain.errors import ConfigError
+from terrain.robots import load_robot
 
-import claims  # noqa: E402
-import danzi  # noqa: E402
-import deremetz  # noqa: E402
-import tazzari  # noqa: E402
-import yamauchi  # noqa: E402
-
-from pipelines.report.pages import html_page  # noqa: E402
-from terrain.control.car_following import SlipSource  # noqa: E402
-from terrain.errors import ConfigError  # noqa: E402
-from terrain.robots import load_robot  # noqa: E402
-
-SEED = 3
+FOLDER, SEED = Path(__file__).parents[2] / "examples" / "papers", 3
 
 
 def rows(paper, *only, seed=SEED):

@@ -1,15 +1,10 @@
 """Slip of a tracked robot from runs with poses: hidden numbers come back; regression and plain algebra."""
 
 import math
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "papers"))
-
 from yamauchi_slip import (
     ILL_CONDITIONED,
     fit_runs,
