@@ -156,15 +156,12 @@ def test_forward_undoes_inverse_and_no_wheel_turns_more_than_a_quarter(twist, st
     np.testing.assert_array_equal(aim[standing], np.array(steer)[standing])
 
 
-def test_steering_follows_over_many_turns_and_reverse_turns_the_wheels_round():
+def test_steering_follows_over_many_turns():
     direction = np.linspace(0.0, 80 * math.pi, 2401)
     courses = np.column_stack([np.cos(direction), np.sin(direction), np.zeros_like(direction)])
     _, wheel, steer = wheel_commands(WHEELS_M, RADIUS_M, LIMITS[0], 100.0, 0.02, courses, np.zeros(3))
     np.testing.assert_allclose(steer, np.repeat(direction[:, None], 3, axis=1), atol=1e-9)
     np.testing.assert_allclose(wheel, 1 / RADIUS_M)
-    wheel, steer = inverse(np.array([[1, 0, 0], [-1, 0, 0]]), [0.1, -0.1, 8 * math.pi])
-    np.testing.assert_allclose(wheel, [[5, 5, 5], [-5, -5, -5]])
-    np.testing.assert_allclose(steer, [[0, 0, 8 * math.pi]] * 2, atol=1e-12)
 
 
 @given(twist=TWISTS, stretch=st.floats(0.1, 50.0))
