@@ -35,6 +35,7 @@ import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from enum import Enum
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -504,7 +505,7 @@ STEPS: dict[str, float] = {p.name: p.step for p in (*PARAMETER.values(), *TILT_O
 #: Parameters that scatter from run to run, in the order in which they are drawn.
 NUISANCES: tuple[str, ...] = tuple(
     p.name
-    for p in sorted((*PARAMETER.values(), *TILT_OFFSETS), key=lambda p: p.scatter_rank)
+    for p in sorted((*PARAMETER.values(), *TILT_OFFSETS), key=attrgetter("scatter_rank"))
     if p.scatter_rank
 )
 #: Parameters that change what sensors measure, and not the motion of the body.
@@ -538,21 +539,18 @@ def effect_named(name: str, drive: str | None = None) -> Effect:
     raise ConfigError(f"effect {name!r} is unknown: use one of {', '.join(e.name for e in LIBRARY)}")
 
 
-def library_of(drive: str) -> tuple[Effect, ...]:
-    """Return the effects that apply to robots of a drive."""
-    return tuple(effect for effect in LIBRARY if drive in effect.drives)
-
-
-def chosen_effects(drive: str, names: Collection[str]) -> tuple[Effect, ...]:
-    """Return effects by their names, in the order of the catalogue.
+def library_of(drive: str, names: Collection[str] | None = None) -> tuple[Effect, ...]:
+    """Return the effects that apply to robots of a drive, or those named, in the order of the library.
 
     Raises
     ------
     ConfigError
-        if one is unknown, or does not apply to robots of a drive.
+        if a name is unknown, or its effect does not apply.
     """
-    chosen = [effect_named(name, drive) for name in names]
-    return tuple(effect for effect in LIBRARY if effect in chosen)
+    if names is not None:
+        chosen = [effect_named(name, drive) for name in names]
+        return tuple(effect for effect in LIBRARY if effect in chosen)
+    return tuple(effect for effect in LIBRARY if drive in effect.drives)
 
 
 def showing(drive: str, known: Collection[str] = ()) -> tuple[Effect, ...]:
@@ -692,7 +690,7 @@ def read_effects_of(texts: Iterable[str], drive: str) -> dict[str, float]:
 
 
 #: Order of the numbers in the vector.
-PARAMETERS: tuple[str, ...] = (*PARAMETER, *[p.name for p in TILT_OFFSETS])
+PARAMETERS: tuple[str, ...] = tuple(STEPS)
 #: Place of each parameter in the vector.
 INDEX: dict[str, int] = {name: i for i, name in enumerate(PARAMETERS)}
 #: The vector as a record: ``vector.view(EFFECTS)[0]`` has the parameters by name.

@@ -83,6 +83,8 @@ def corrected(robot: AnyRobot) -> AnyRobot:
     >>> round(robot.wheel_radius_m, 3), dict(robot.effects)
     (0.21, {})
     """
+    if not robot.effects:
+        return robot
     return _without(apply_homes(robot), [name for name in robot.effects if PARAMETER[name].inverse])
 
 

@@ -57,9 +57,8 @@ def slip_ratio(
     """
     if not 0 < min_speed_mps < np.inf:
         raise ConfigError(f"min_speed_mps is {min_speed_mps:g}, a speed above zero is required")
-    wheel_speed, ground = np.broadcast_arrays(
-        *(np.asarray(v, float) for v in (wheel_speed_mps, ground_speed_mps))
-    )
+    speeds = np.asarray(wheel_speed_mps, float), np.asarray(ground_speed_mps, float)
+    wheel_speed, ground = np.broadcast_arrays(*speeds)
     fastest = np.maximum(np.abs(wheel_speed), np.abs(ground))
     known = np.isfinite(fastest)
     slip = np.where(known & (fastest < min_speed_mps), stationary, np.nan)
@@ -100,6 +99,6 @@ def slip_angle(forward_mps: Any, left_mps: Any, min_speed_mps: float = MIN_SPEED
     >>> slip_angle([1.0, -1.0, 0.0], [0.1, 0.1, -0.02]).round(4)
     array([0.0997, 0.0997,    nan])
     """
-    forward, left = np.broadcast_arrays(*(np.asarray(v, float) for v in (forward_mps, left_mps)))
+    forward, left = np.broadcast_arrays(np.asarray(forward_mps, float), np.asarray(left_mps, float))
     moving = np.hypot(forward, left) >= min_speed_mps
     return np.where(moving, np.arctan2(left, np.abs(forward)), np.nan)

@@ -138,7 +138,7 @@ def explain(
     from terrain.discrepancy.next_drive import next_command
     from terrain.discrepancy.powertrain import powertrain_of
     from terrain.discrepancy.robot_terms import in_robot_terms
-    from terrain.effects import chosen_effects, showing
+    from terrain.effects import library_of, showing
     from terrain.extension import region_of
     from terrain.logs.run_folders import data_digest
     from terrain.robots import load_robot
@@ -147,7 +147,7 @@ def explain(
     robot = load_robot(robot) if isinstance(robot, str) else robot
     description = description or robot.name
     names, seed = asked.effects, asked.seed
-    library = showing(robot.drive, robot.effects) if names is None else chosen_effects(robot.drive, names)
+    library = showing(robot.drive, robot.effects) if names is None else library_of(robot.drive, names)
     chosen = chosen_runs(runs, robot, asked.terrain)
     diagnosed = diagnose_runs(chosen, robot, library, asked.hold_out, seed)
     progress("diagnose", 1, 1)

@@ -10,6 +10,7 @@ import re
 import stat
 import unicodedata
 from collections.abc import Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -148,7 +149,7 @@ def data_folder(kind: str) -> Path:
 
 def packaged(kind: str) -> tuple[str, ...]:
     """Return the names of the packaged YAML of one kind."""
-    return tuple(sorted(file.stem for file in data_folder(kind).glob("*.yaml")))
+    return tuple(sorted(map(attrgetter("stem"), data_folder(kind).glob("*.yaml"))))
 
 
 def described_file(name_or_path: str | Path, what: str, *kinds: str) -> Path:
