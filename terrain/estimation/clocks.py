@@ -391,21 +391,21 @@ class Inbox:
         if stream not in self._channels:
             self.refused["stream that was not announced"] += 1
             return None
-        stamps, rows, n_columns = numbers(time_s), numbers(values), len(self._channels[stream])
-        if stamps is None or rows is None or rows.shape != (stamps.size, n_columns) or stamps.ndim != 1:
+        reading, n_columns = readable((time_s, values)), len(self._channels[stream])
+        if reading is None or reading.values.shape[1] != n_columns:
             self.refused[f"{stream}: not rows of {n_columns} numbers"] += 1
             return None
-        if not stamps.size:
+        if not reading.time_s.size:
             return None
         queued = self._queued[stream]
-        queued.append(Reading(stamps, rows))
-        self.received[stream] += stamps.size
-        self._n_queued[stream] += stamps.size
+        queued.append(reading)
+        self.received[stream] += reading.time_s.size
+        self._n_queued[stream] += reading.time_s.size
         while self._n_queued[stream] > MAX_QUEUED and len(queued) > 1:
             n = queued.pop(0).time_s.size
             self._n_queued[stream] -= n
             self.refused[f"{stream}: too many wait"] += n
-        return max(filter(math.isfinite, stamps.tolist()), default=None)
+        return max(filter(math.isfinite, reading.time_s.tolist()), default=None)
 
     def take(self, time_s: float) -> dict[str, Reading]:
         """Return what is queued at a time of the robot's clock, as one reading a stream, and empty the queue."""

@@ -197,7 +197,6 @@ class SlipOdometry(FilterObserver):
         before
     settings : noise and limits
     name : of the table of this module; that of ``slip-learning`` takes fixes
-    slips : those of :data:`SLIPS` that it knows
 
     Raises
     ------
@@ -228,7 +227,6 @@ class SlipOdometry(FilterObserver):
         model: SlipModel,
         settings: OdometrySettings = DEFAULTS,
         name: str = "slip-odometry",
-        slips: tuple[str, ...] = SLIPS,
     ) -> None:
         self._learns, self._settings, self._model = name == "slip-learning", settings, model
         self._prior = prior = np.sqrt(np.diag(model.covariance))
@@ -268,7 +266,8 @@ class SlipOdometry(FilterObserver):
         super().__init__(filter_model, FILTER_SETTINGS)
         self.filter.cov[_MODEL, _MODEL] += model.covariance - np.diag(prior**2)
         self.rows = (*ROWS, *FIX_ROWS) if self._learns else ROWS
-        self.states, self.slips = (*STATES, *(PARAMETERS if self._learns else ())), slips
+        self.states = (*STATES, *(PARAMETERS if self._learns else ()))
+        self.slips = SLIPS[: {"encoder-odometry": 0, "gyrodometry": 0, "endo": 2}.get(name)]
         self._is_located, self._displacement_rad, self._tilt_rad = not self._learns, 0.0, (0.0, 0.0)
         self._fastest_mps = BLIND_MPS
         self._output = self._output_of(np.zeros(6), 0.0, ObserverStatus.STARTING)
@@ -400,4 +399,4 @@ def plain_odometry(name: str, robot: TrackedRobot, model: SlipModel = NO_SLIP) -
     )
     thresholds = {"encoder-odometry": math.inf, "gyrodometry": GYRODOMETRY_THRESHOLD_RADPS, "endo": 0.0}
     settings = OdometrySettings(gyro_threshold_radps=thresholds[name])
-    return SlipOdometry(robot, known, settings, name, SLIPS[:2] if name == "endo" else ())
+    return SlipOdometry(robot, known, settings, name)

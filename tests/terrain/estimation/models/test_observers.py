@@ -120,7 +120,7 @@ def feed_of(run):
     return feed, lambda name, time_s, values: feed.queues[name].push(np.array(time_s), values), tick
 
 
-def test_stamps_that_are_no_time_and_channels_that_are_unknown_do_not_take_the_others_along(turning):
+def test_what_is_no_time_unknown_or_waited_long_for_the_wheels_does_not_take_the_others_along(turning):
     _, push, tick = feed_of(turning)
     imu = turning.streams["imu"].values[:4].copy()
     imu[1, 2] = np.nan
@@ -130,15 +130,12 @@ def test_stamps_that_are_no_time_and_channels_that_are_unknown_do_not_take_the_o
     row = tick(0.04)
     assert np.isfinite(row[NAMES.index("roll_rad")])
     assert row[NAMES.index("yaw_rate_radps")] == pytest.approx(imu[3, 2])  # held
-
-
-@pytest.mark.parametrize(("tick_s", "late"), [(0.35, False), (0.45, True)])
-def test_a_fix_that_waited_long_for_the_wheels_is_left_out_and_counted(turning, tick_s, late):
-    feed, push, tick = feed_of(without(turning, "pose"))
-    for name in ("gnss", "compass"):
-        push(name, [0.1], turning.streams[name].values[:1])
-    assert np.isnan(tick(tick_s)[2:5]).tolist() == [late] * 3
-    assert feed.dropped == ({"gnss: late": 1, "compass: late": 1} if late else {})
+    for tick_s, late in ((0.35, {}), (0.45, {"gnss: late": 1, "compass: late": 1})):
+        feed, push, tick = feed_of(without(turning, "pose"))
+        for name in ("gnss", "compass"):
+            push(name, [0.1], turning.streams[name].values[:1])
+        assert np.isnan(tick(tick_s)[2:5]).tolist() == [bool(late)] * 3
+        assert feed.dropped == late
 
 
 def test_samples_that_cannot_be_are_left_out_and_counted(turning):

@@ -83,45 +83,37 @@ def test_endos_law_is_27_and_7_and_regular_where_a_track_stops(n):
     assert slip_imbalance(0.0, 0.0, n) == slip_imbalance(-0.1, 0.1, n) == 0.0
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_straight_motion_is_the_straight_law_and_gravity_sets_the_sign_in_reverse(sign):
-    v_x, v_y = velocity(0.1 * sign, 0.1 * sign, 0.0, roll=0.2, pitch=-0.1)
-    assert v_x == pytest.approx(0.1 * (sign * (1 - 0.05) - 0.4 * 0.1))
-    assert v_y == pytest.approx(-abs(v_x) * 0.5 * 0.2)
-
-
-def test_a_turn_is_the_regression_and_the_drift_and_its_mirror_images():
+def test_straight_motion_is_the_straight_law_and_a_turn_the_regression_and_the_drift():
+    for sign in (1.0, -1.0):  # gravity sets the sign in reverse
+        v_x, v_y = velocity(0.1 * sign, 0.1 * sign, 0.0, roll=0.2, pitch=-0.1)
+        assert v_x == pytest.approx(0.1 * (sign * (1 - 0.05) - 0.4 * 0.1))
+        assert v_y == pytest.approx(-abs(v_x) * 0.5 * 0.2)
     x = np.array([1, 0.05, 0.14 / (2 * D), 0.25, 0.1, -0.05, 0.3, np.arccos(np.cos(0.1) * np.cos(0.05))])
     v_x, v_y = velocity(-0.02, 0.12, 0.25)
     drift = -0.2 * 0.25 * 0.1 + 0.15 * 0.25 * 0.05
     assert v_y == pytest.approx(v_x * math.tan(float(x @ MODEL.angle)) + drift)
-    right = velocity(0.12, -0.02, -0.25, roll=-0.1, displacement=-0.3)
+    right = velocity(0.12, -0.02, -0.25, roll=-0.1, displacement=-0.3)  # mirror images
     assert right == pytest.approx([v_x, -v_y])
     assert velocity(0.02, -0.12, -0.25, pitch=0.05, displacement=-0.3) == pytest.approx([-v_x, v_y])
 
 
-def sweeps():
-    s = np.linspace(-1, 1, 2001)
-    yield "straight to spin", 0.05 - 0.1 * np.abs(s), 0.05 + 0.1 * np.abs(s)
-    yield "left track stops", 0.05 * s, np.full_like(s, 0.1)
-    yield "spin to reverse", -0.1 + 0.05 * s, 0.1 + 0.05 * s
-    yield "forward to reverse", 0.1 * s, 0.08 * s
-    yield "left turn to right turn", 0.1 + 0.03 * s, 0.1 - 0.03 * s
+S = np.linspace(-1, 1, 2001)
+SWEEPS = {
+    "straight to spin": (0.05 - 0.1 * np.abs(S), 0.05 + 0.1 * np.abs(S)),
+    "left track stops": (0.05 * S, np.full_like(S, 0.1)),
+    "spin to reverse": (-0.1 + 0.05 * S, 0.1 + 0.05 * S),
+    "forward to reverse": (0.1 * S, 0.08 * S),
+    "left turn to right turn": (0.1 + 0.03 * S, 0.1 - 0.03 * S),
+}
 
 
 @pytest.mark.parametrize("n", [0.3, 1.0, 1.5])
-@pytest.mark.parametrize("sweep", list(sweeps()), ids=lambda each: each[0])
+@pytest.mark.parametrize("sweep", SWEEPS)
 def test_the_velocity_has_no_jump(n, sweep):
-    _, left, right = sweep
-    theta = np.array([n, *THETA[1:]])
-    w = 0.6 * (right - left) / (2 * D)
-    coarse, fine = (
-        np.abs(
-            np.diff([velocity(*each, displacement=0.0, theta=theta) for each in rows[::every]], axis=0)
-        ).max()
-        for rows in [np.stack([left, right, w], axis=1)]
-        for every in (4, 1)
-    )
+    left, right = SWEEPS[sweep]
+    theta, w = np.array([n, *THETA[1:]]), 0.6 * (right - left) / (2 * D)
+    rows = [velocity(*row, displacement=0.0, theta=theta) for row in zip(left, right, w, strict=True)]
+    coarse, fine = (np.abs(np.diff(rows[::every], axis=0)).max() for every in (4, 1))
     assert fine < min(0.72 * coarse, 0.01)  # it falls with the step: |v|^(1/2) halves over a quarter of it
 
 
