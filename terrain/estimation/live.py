@@ -558,11 +558,7 @@ class LiveObserver(Live):
         channels: Mapping[str, tuple[str, ...]],
         correction: Correction | None = None,
     ) -> None:
-        self.observer, self._feed, self._before_s = (
-            observer,
-            ObserverFeed(robot, observer.rows, channels),
-            math.nan,
-        )
+        self.observer, self._feed = observer, ObserverFeed(robot, observer.rows, channels)
         self.name, self.states = observer.name, observer.states
         super().__init__(channels, self._feed.queues, 0.0, correction)
 
@@ -576,20 +572,17 @@ class LiveObserver(Live):
 
     def _forget(self) -> None:
         self._feed.begin()
-        self._before_s = math.nan
 
-    def _snapshot(self) -> tuple[float, Any, Any]:
-        return self._before_s, self._feed.snapshot(), self.observer.snapshot()
+    def _snapshot(self) -> tuple[Any, Any]:
+        return self._feed.snapshot(), self.observer.snapshot()
 
-    def _restore(self, memory: tuple[float, Any, Any]) -> None:
-        self._before_s, of_feed, of_observer = memory
-        self._feed.restore(of_feed)
-        self.observer.restore(of_observer)
+    def _restore(self, memory: tuple[Any, Any]) -> None:
+        for one, snapshot in zip((self._feed, self.observer), memory, strict=True):
+            one.restore(snapshot)
 
     def _estimate(self, tick: Tick, leapt: Tick | None) -> LiveObserverEstimate:
         due = {name: queue.take(tick.time_s) for name, queue in self._queues.items()}
-        dt_s = 0.0 if math.isnan(self._before_s) else tick.time_s - self._before_s
-        self._before_s = tick.time_s
+        dt_s = 0.0 if self._feed.last_s == -math.inf else tick.time_s - self._feed.last_s
         wheels = self._no_wheels if tick.wheels is None else tick.wheels
         output = self.observer.step(self._feed.tick(tick.time_s, wheels, due), dt_s)
         return LiveObserverEstimate(tick.time_s, *output[:4], ObserverStatus(output.status))

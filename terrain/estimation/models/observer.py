@@ -211,6 +211,7 @@ class ObserverFeed(_WithMemory):
     Attributes
     ----------
     queues : of the streams beside the wheels that are read
+    last_s : stamp of the last tick; minus infinity before the first
     dropped : what was left out, as counts by stream and kind: wheels not later than the sample before, late or
         inaccurate fixes, and clocks that were set back
     """
@@ -229,7 +230,7 @@ class ObserverFeed(_WithMemory):
 
     def begin(self) -> None:
         """Begin anew: nothing was measured before."""
-        self._last_s = -math.inf
+        self.last_s = -math.inf
         for queue in self.queues.values():
             queue.taken_s = -math.inf
         self._held: dict[tuple[str, int], tuple[float, float]] = {}
@@ -237,7 +238,7 @@ class ObserverFeed(_WithMemory):
 
     def follows(self, time_s: float) -> int:
         """Return what a stamp of the wheels is: 1 taken, -1 of a clock that was set back, 0 not taken, and counted."""
-        before_s = self._last_s
+        before_s = self.last_s
         if before_s < time_s < math.inf:
             self._n_behind = 0
             return 1
@@ -248,7 +249,7 @@ class ObserverFeed(_WithMemory):
 
     def tick(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> Array:
         """Return the row (m,) at a sample of the wheels, of the samples of other streams that came since the last."""
-        self._last_s = time_s
+        self.last_s = time_s
         for name, samples in due.items():
             if not samples and self.queues[name].n_behind >= CLOCK_SET_SAMPLES:  # its own clock was set back
                 self.dropped["time: clock set"] += 1
