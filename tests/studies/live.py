@@ -165,7 +165,7 @@ def run(settings: Settings, progress: Progress = silent) -> LiveLatencies:
         progress("live", 4, n_stages)
         channels = serving.sent_channels(log)
         begun_s = perf_counter()
-        with serving.service_process(["--model", uri, "--robot", ROBOT]) as service:
+        with serving.ServiceProcess(["--model", uri, "--robot", ROBOT]) as service:
             each = _within(serving.messages_of(log, 100.0, 100.0), settings.seconds)
             asyncio.run(serving.drive(service.socket_url, serving.hello("first", channels), each[:3]))
             start_s, rss_mb = perf_counter() - begun_s, service.rss_mb

@@ -6,11 +6,10 @@ import asyncio
 import subprocess
 import sys
 import urllib.request
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from time import monotonic
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import msgpack
 import numpy as np
@@ -159,7 +158,7 @@ async def drive_all(
 
 
 class ServiceProcess:
-    """A running service.
+    """A running service, which ends with a ``with`` block.
 
     Attributes
     ----------
@@ -178,6 +177,12 @@ class ServiceProcess:
             lines = text.strip().splitlines()
             raise TerrainError(f"the service did not start: {lines[-1] if lines else 'it says nothing'}")
         self.url = line.rsplit(" at ", 1)[1].strip()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self.stop()
 
     @property
     def socket_url(self) -> str:
@@ -205,13 +210,3 @@ class ServiceProcess:
             self.process.kill()
             self.process.communicate()
         return int(self.process.returncode)
-
-
-@contextmanager
-def service_process(options: Sequence[str]) -> Iterator[ServiceProcess]:
-    """Run a service while a block lasts."""
-    running = ServiceProcess(options)
-    try:
-        yield running
-    finally:
-        running.stop()

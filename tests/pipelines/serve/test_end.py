@@ -10,7 +10,7 @@ import threading
 import time
 
 import pytest
-from studies.service import service_process
+from studies.service import ServiceProcess
 
 from pipelines.live.session import Hello
 from pipelines.serve.client import ServiceError, TerrainClient
@@ -50,7 +50,7 @@ def test_a_service_that_is_ended_under_load_goes_on_after_a_restart(
         return {int(name.removeprefix("robot-")): state["terrain"] for name, state in states.items()}
 
     options = ["--model", str(model_folder), "--state", str(tmp_path)]
-    with service_process(options) as serving, service_process(options) as again:
+    with ServiceProcess(options) as serving, ServiceProcess(options) as again:
         threads = [
             threading.Thread(
                 target=stream, args=(serving.socket_url, k, two_drives[3 * (k % 2)], terrains, reasons)
