@@ -226,17 +226,17 @@ def stopping_distance(history: DriveHistory, start_s: float) -> float:
     return distance_within(history, start_s, end_s - start_s) if math.isfinite(end_s) else math.nan
 
 
-def adaptation_times(
-    control: Stream, changes: Sequence[tuple[float, float]], close: float = 0.02
-) -> list[float]:
-    """Return the time in s from each change of terrain until the pilot's target was as close to the new one.
+def adaptation_times(control: Stream, changes: Sequence[tuple[float, float]]) -> list[float]:
+    """Return the time in s from each change of terrain until the pilot's target is that of the new one.
 
-    A change is its time and the target of the new terrain; NaN where it was not close before the next change.
+    A change is its time and the target of the new terrain; NaN where the pilot's did not come within
+    :data:`TARGET_CHANGE` of it before the next change.
     """
     target, found = control.channel("target_ratio"), []
     ends_s = [*(change_s for change_s, _ in changes[1:]), math.inf]
     for (change_s, desired), end_s in zip(changes, ends_s, strict=False):
-        near = (control.time_s >= change_s) & (control.time_s < end_s) & (np.abs(target - desired) <= close)
+        near = (control.time_s >= change_s) & (control.time_s < end_s)
+        near &= np.abs(target - desired) <= TARGET_CHANGE
         found.append(float(control.time_s[near.argmax()] - change_s) if near.any() else math.nan)
     return found
 

@@ -133,8 +133,7 @@ LEVEL = Slope()
 TRACKS = record(
     numbers(
         "half_m length_m width_m height_m mass_kg inertia_kgm2 area_m2 cohesion_pa tan_friction "
-        "shear_modulus_m kc_npmn1 kphi_npmn2 exponent_ratio rolling_ratio passive_ratio "
-        "bulldozing_ratio until_m"
+        "shear_modulus_m kc_npmn1 kphi_npmn2 exponent_ratio rolling_ratio passive_ratio until_m"
     )
     | dict.fromkeys(PrescribedSlip._fields, float)
     | {"sheared": bool}
@@ -163,12 +162,7 @@ def tilt_at(angle_rad: float, uphill_rad: float, yaw_rad: float) -> tuple[float,
     return grade, math.asin(min(max(side, -1.0), 1.0))
 
 
-def tracks_on(
-    robot: TrackedRobot,
-    ground: Soil | PrescribedSlip,
-    until_m: float = math.inf,
-    bulldozing_ratio: float = 1.0,
-) -> Array:
+def tracks_on(robot: TrackedRobot, ground: Soil | PrescribedSlip, until_m: float = math.inf) -> Array:
     """Return a robot on a ground, (1,) of :data:`TRACKS`.
 
     Parameters
@@ -177,7 +171,6 @@ def tracks_on(
     ground : a soil that shears, without Bekker's numbers no rut is pressed and nothing is pushed aside; or the slip
         itself
     until_m : distance travelled at which the ground ends
-    bulldozing_ratio : factor on what sides push; 0 for none
 
     Raises
     ------
@@ -214,10 +207,9 @@ def tracks_on(
         "rolling_ratio": ground.rolling_resistance_ratio,
         "passive_ratio": math.tan(math.pi / 4 + ground.friction_angle_rad / 2) ** 2,
         "exponent_ratio": ground.sinkage_exponent_ratio,
-        "bulldozing_ratio": bulldozing_ratio,
     }
     if not math.isfinite(ground.kphi_npmn2):  # no rut is pressed, and nothing pushed aside
-        described |= dict.fromkeys(("kc_npmn1", "kphi_npmn2", "exponent_ratio", "bulldozing_ratio"), 0.0)
+        described |= dict.fromkeys(("kc_npmn1", "kphi_npmn2", "exponent_ratio"), 0.0)
     return filled(TRACKS, **described)
 
 
@@ -273,8 +265,8 @@ def track_forces(
         depth = rut_depth(tracks, load_n)
         cohesive = 2.0 * tracks.cohesion_pa * depth * math.sqrt(passive)
         square, heap = depth * depth, 2.0 * (inner_share(twist, y) * heap_m2)
-        flank = tracks.bulldozing_ratio * (0.5 * UNIT_WEIGHT_NPM3 * square * passive + cohesive)
-        heaped = tracks.bulldozing_ratio * (0.5 * UNIT_WEIGHT_NPM3 * (square + heap) * passive + cohesive)
+        flank = 0.5 * UNIT_WEIGHT_NPM3 * square * passive + cohesive
+        heaped = 0.5 * UNIT_WEIGHT_NPM3 * (square + heap) * passive + cohesive
         for i in range(ELEMENTS):
             x = 0.5 * length - (i + 0.5) * step
             age = abs(front - x) / creep
