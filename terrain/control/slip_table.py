@@ -177,7 +177,18 @@ def load_slip_table(
         )
     curves = {terrain: entry.curve for terrain, entry in entries.items() if entry.curve is not None}
     for terrain, curve in curves.items():
-        _check_curve(f"{file}: {terrain}, curve", curve)
+        where = f"{file}: {terrain}, curve"
+        if curve.law not in LAW_PARAMETERS:
+            laws = ", ".join(LAW_PARAMETERS)
+            raise ConfigError(f"{where}: law is {curve.law!r}; it must be one of {laws}")
+        check_keys(f"{where}: parameters", dict(curve.parameters), list(LAW_PARAMETERS[curve.law]))
+        for name, least, most in zip(LAW_PARAMETERS[curve.law], *LAW_BOUNDS[curve.law], strict=True):
+            if not least <= (value := curve.parameters[name]) <= most:
+                raise ConfigError(f"{where}: {name} is {value:g}; {least:g} to {most:g} are accepted")
+        for name in ("peak_interval_ratio", "slip_range_ratio"):
+            low, high = getattr(curve, name)
+            if low > high:
+                raise ConfigError(f"{where}: {name} is {low:g} to {high:g}; two rising numbers are required")
     reasons = {terrain: entry.reason for terrain, entry in entries.items() if entry.reason}
     return SlipTable(str(content["name"]), fallback, targets, owner, curves, reasons)
 
@@ -203,19 +214,6 @@ def _targets(place: str, terrain: str, entry: _Entry) -> dict[str, SlipTarget]:
             f"{place}: steady slip {steady:g} is over that of traction, {traction:g}; targets must rise"
         )
     return targets
-
-
-def _check_curve(where: str, curve: CurveEntry) -> None:
-    if curve.law not in LAW_PARAMETERS:
-        raise ConfigError(f"{where}: law is {curve.law!r}; it must be one of {', '.join(LAW_PARAMETERS)}")
-    check_keys(f"{where}: parameters", dict(curve.parameters), list(LAW_PARAMETERS[curve.law]))
-    for name, least, most in zip(LAW_PARAMETERS[curve.law], *LAW_BOUNDS[curve.law], strict=True):
-        if not least <= (value := curve.parameters[name]) <= most:
-            raise ConfigError(f"{where}: {name} is {value:g}; {least:g} to {most:g} are accepted")
-    for name in ("peak_interval_ratio", "slip_range_ratio"):
-        low, high = getattr(curve, name)
-        if low > high:
-            raise ConfigError(f"{where}: {name} is {low:g} to {high:g}; two rising numbers are required")
 
 
 def write_slip_table(table: SlipTable, path: str | Path) -> None:

@@ -280,38 +280,6 @@ class PlanarDrive(NamedTuple):
     drifts: bool = True  # whether the body goes sideways by what the ground adds, and on a side hill
 
 
-def body_numbers(robot: Robot, ground: Ground) -> Array:
-    """Return what a robot and a ground are to every drive, (1,) of :data:`PLANAR_BODY`.
-
-    What a description leaves out does not act: without motors a traction of 1 N counts as 1 A, without a camera the
-    speed is that of the body's origin, without delay.
-    """
-    complete = robot.completed
-    body, camera, sensors, motors = complete.body, complete.camera, complete.sensors, complete.motors
-    parts = (robot, ground, camera, sensors, motors, body)  # yaw inertia is that of the section
-    described = {n: getattr(part, n) for part in parts for n in PLANAR_BODY.names or () if hasattr(part, n)}
-    n, thrust = len(robot.wheels), np.array(ground.thrust_ratio)
-    soft = np.full(N_SLIPS, ground.slip_ratio)  # slip over traction at even slips
-    if thrust.size >= 4:
-        slip, ratio = np.linspace(0.0, 1.0, thrust.size), np.empty(thrust.size)
-        ratio[1:] = slip[1:] / thrust[1:]
-        ratio[0] = 2.0 * ratio[1] - ratio[2]
-        soft = ratio if thrust.size == N_SLIPS else np.interp(_SLIPS, slip, ratio)
-    described |= {
-        "n_wheels": n,
-        "radius_m": robot.wheel_radius_m,
-        "rotating_kg": n * body.wheel_inertia_kgm2 / robot.wheel_radius_m**2,
-        "friction_nm": n * motors.friction_nm,
-        "latency_s": camera.latency_s + camera.time_constant_s,
-        "imu_lag_s": IMU_LAG_S if isinstance(robot, SwerveRobot) else 0.0,
-        "encoder_lag_s": sensors.encoder_time_constant_s,
-        "soft_ratio": soft,
-        "scrub_ratio": ground.scrub_ratio if robot.skids else 0.0,
-        "seen_from_above": robot.on_omni_wheels,
-    }
-    return filled(PLANAR_BODY, **described)
-
-
 @njit
 def slopes(values: Array, dt: float) -> Array:
     """Return the rate (n,) of a signal, right to the fourth order where two neighbours are there.
@@ -1013,10 +981,36 @@ class Planar(NamedTuple):
 
 
 def make_planar(robot: Robot, ground: Ground) -> Planar:
-    """Return the planar plant of a robot on a ground; what a description leaves out does not act."""
-    drive = DRIVES[robot.drive]
-    params = filled(drive.record, body=body_numbers(robot, ground), **drive.numbers(robot, ground))
-    return Planar(robot, drive, params)
+    """Return the planar plant of a robot on a ground.
+
+    What a description leaves out does not act: without motors a traction of 1 N counts as 1 A, without a camera the
+    speed is that of the body's origin, without delay.
+    """
+    complete = robot.completed
+    body, camera, sensors, motors = complete.body, complete.camera, complete.sensors, complete.motors
+    parts = (robot, ground, camera, sensors, motors, body)  # yaw inertia is that of the section
+    described = {n: getattr(part, n) for part in parts for n in PLANAR_BODY.names or () if hasattr(part, n)}
+    n, thrust = len(robot.wheels), np.array(ground.thrust_ratio)
+    soft = np.full(N_SLIPS, ground.slip_ratio)  # slip over traction at even slips
+    if thrust.size >= 4:
+        slip, ratio = np.linspace(0.0, 1.0, thrust.size), np.empty(thrust.size)
+        ratio[1:] = slip[1:] / thrust[1:]
+        ratio[0] = 2.0 * ratio[1] - ratio[2]
+        soft = ratio if thrust.size == N_SLIPS else np.interp(_SLIPS, slip, ratio)
+    described |= {
+        "n_wheels": n,
+        "radius_m": robot.wheel_radius_m,
+        "rotating_kg": n * body.wheel_inertia_kgm2 / robot.wheel_radius_m**2,
+        "friction_nm": n * motors.friction_nm,
+        "latency_s": camera.latency_s + camera.time_constant_s,
+        "imu_lag_s": IMU_LAG_S if isinstance(robot, SwerveRobot) else 0.0,
+        "encoder_lag_s": sensors.encoder_time_constant_s,
+        "soft_ratio": soft,
+        "scrub_ratio": ground.scrub_ratio if robot.skids else 0.0,
+        "seen_from_above": robot.on_omni_wheels,
+    }
+    drive, of_body = DRIVES[robot.drive], filled(PLANAR_BODY, **described)
+    return Planar(robot, drive, filled(drive.record, body=of_body, **drive.numbers(robot, ground)))
 
 
 def move(
