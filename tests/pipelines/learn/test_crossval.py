@@ -113,17 +113,14 @@ def test_what_is_learned_slow_and_does_not_apply_fast_is_detected(drive, setting
         assert low <= found.accuracy <= high
 
 
-def test_a_protocol_and_the_extra_of_one_name_give_one_number(with_extras, settings):
+def test_a_protocol_and_the_extra_of_one_name_give_one_number_and_sequences_are_judged(with_extras, settings):
     runs, extras = with_extras
     assert extras.slow_fast.status == "applicable"
     found = crossval(runs, settings(protocol="slow-fast"))
     assert found.accuracy == pytest.approx(extras.slow_fast.slow_to_fast)
     assert found.notes[0].startswith("fast runs held out, slow ones trained on")
     assert {run.run_id[-1] for run in found.per_run} == {"2", "3"}
-
-
-def test_sequences_are_judged_beside_single_windows(with_extras):
-    document = as_json(with_extras[1])
+    document = as_json(extras)  # sequences are judged beside single windows
     assert document["courses"]["n_courses"] == 5
     assert document["recorded_courses"] is None
     low, high = document["filtered_accuracy_ci"]

@@ -150,7 +150,6 @@ def test_a_manifest_of_a_stranger_is_one_sentence(model_dir):
         ({"files": {}}, "its list of files is not that of a model"),
         ({"files": {**files, "../x": "a"}}, "its list of files is not"),
         ({"files": {MODEL_FILE: "5"}}, r"is damaged \(SHA-256"),
-        ({"info": info | {"classes": ["grass", 3]}}, r"info\.classes\.1: Input should be a valid string"),
         ({"info": info | {"classes": ["ice", "mud", "sand"]}}, "its classes are not those of the manifest"),
         ({"info": info | {"window_s": -2.0}}, r"is damaged \(window length_s is -2\.0"),
         ({"info": info | {"window_s": 10**400}}, "more than 64 bits"),

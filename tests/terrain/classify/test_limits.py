@@ -14,14 +14,12 @@ from terrain.classify.limits import (
     KNOWN_KEPT,
     REACH,
     SPEED_STEP_MPS,
-    SUPPORTED,
     YAW_STEP_RADPS,
     check_novelty,
     check_support,
     conformal_threshold,
     learn_novelty,
     learn_support,
-    supported_probability,
 )
 from terrain.errors import DataError
 
@@ -146,14 +144,6 @@ def test_the_table_counts_the_runs_that_are_near(seed):
     speed, yaw, *_ = windows(seed + 1, 20)
     table = learn_support(*training, CLASSES)
     np.testing.assert_array_equal(table.near_runs(speed, yaw), counted(training, speed, yaw))
-
-
-@given(st.floats(0.5, 1), st.integers(0, 50))
-def test_the_supported_probability_never_exceeds_the_probability_and_grows_with_runs(probability, n_runs):
-    stated = np.array([[probability, 1 - probability]])
-    few, more = (supported_probability(stated, np.array([[n, 99]]))[0] for n in (n_runs, n_runs + 1))
-    assert few < more <= probability
-    assert n_runs > 0 or few < SUPPORTED
 
 
 def draw_scores(rng, n_runs):

@@ -1,4 +1,4 @@
-"""The filter of the terrain over time by its plain form, and time without an output."""
+"""The filter of the terrain over time by its plain form, in which a refused window only lets time pass."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from terrain.classify import terrain_filter as constants
-from terrain.classify.terrain_filter import FilterBelief, check_prior, filter_run, filter_step, grounds_of
+from terrain.classify.terrain_filter import check_prior, filter_run
 from terrain.errors import ConfigError, DataError
 
 THREE = np.array([0.5, 0.3, 0.2])
@@ -49,19 +49,6 @@ def test_the_filter_agrees_with_a_dense_matrix_exponential(seed):
     found = filter_run(probability, time_s, THREE, novelty)
     np.testing.assert_allclose(found, dense_filter(probability, time_s, THREE, novelty), atol=1e-9)
     np.testing.assert_allclose(found.sum(axis=1), 1.0, atol=1e-12)
-
-
-def test_refused_windows_only_let_time_pass():
-    refused = np.full(3, np.nan)
-    begin = FilterBelief(np.array([0.9, 0.05, 0.03, 0.02]), 0.0)
-    in_steps = begin
-    for _ in range(28):
-        in_steps = filter_step(in_steps, refused, 0.25, THREE)
-    at_once = filter_step(begin, refused, 7.0, THREE)
-    np.testing.assert_allclose(in_steps.probability, at_once.probability, atol=1e-12)
-    assert in_steps.silent_s == at_once.silent_s == 7.0
-    forgotten = filter_step(begin, refused, 1e6, THREE)
-    np.testing.assert_allclose(forgotten.probability, grounds_of(3), atol=1e-12)
 
 
 def test_what_means_nothing_or_does_not_fit_is_refused():
