@@ -45,7 +45,10 @@ REFUSED = {
         ("furlong", ". --format csv --mapping map.yaml"),
         (LAUGHED, "data --format csv --mapping laughs.yaml"),
     ],
-    "convert data": [("cannot be written", "--out file/out")],
+    "convert data": [
+        ("cannot be written", "--out file/out"),
+        ("--to is 'bag': input should be 'runs', 'mcap'", "--to bag --out other"),
+    ],
     "quickstart --data data": [("cannot be written", "--out file/out")],
     "label data --run r": [
         ("there is no run 'SNOW_03'", "--run SNOW_03 --all --terrain ICE"),
@@ -127,6 +130,7 @@ REFUSED = {
         ("--laws ends in 'simulator'", "--what soil --laws inflow,simulator"),
         ("--draws is 1: input should be greater than or equal to 2", "--what soil --draws 1"),
         ("none of 1 runs is a trial of a wheel testbed", "--what soil --out new"),
+        ("has no tracks; --what odometry is for 'tracked'", "--what odometry --robot husky"),
         ("file: cannot be written", "--what soil --out file"),
     ],
     "simulate --out runs --terrain grass --scenario straight --robot agrimaro": [

@@ -325,6 +325,8 @@ def test_a_bus_that_fails_is_opened_again_and_what_it_refuses_is_counted(monkeyp
         opened.append(FailingBus(odd if not opened else []))
         return opened[-1]
 
+    with pytest.raises(ConfigError, match=r"--can is 'nothing'; python-can knows .*socketcan"):
+        open_bus("nothing", "can0")
     with pytest.raises(ConfigError, match="the bus socketcan 'no0' cannot be opened"):
         Link(lambda: open_bus("socketcan", "no0"))
     link, bridge = Link(make_bus), bridged()
