@@ -420,10 +420,6 @@ def turn_camera(values: Array, channels: tuple[str, ...], angle_rad: float) -> N
             values[:, j] = sin * x + cos * y
 
 
-def _act_camera_yaw(block: Block, angle_rad: float) -> None:
-    turn_camera(block.values, block.channels, angle_rad)
-
-
 def _undo_camera_yaw(block: Block, angle_rad: float) -> None:
     if block.stream != "pose":
         turn_camera(block.values, block.channels, -angle_rad)
@@ -447,7 +443,9 @@ UNDO: dict[str, Callable[[Block, float], None]] = {
         *(_undo_steering_backlash, _undo_camera_yaw),
     )
 }
-ACT: dict[str, Callable[[Block, float], None]] = {"camera_yaw": _act_camera_yaw}
+ACT: dict[str, Callable[[Block, float], None]] = {
+    "camera_yaw": lambda block, angle_rad: turn_camera(block.values, block.channels, angle_rad)
+}
 
 
 def _read_library(path: Path) -> tuple[Effect, ...]:
@@ -822,11 +820,8 @@ def checked_covariance(place: str, covariance: Array) -> Array:
     Traceback (most recent call last):
     terrain.errors.ConfigError: covariance is not positive semi-definite: its correlations have eigenvalue -1
     """
-    if (
-        covariance.ndim != 2
-        or covariance.shape[0] != covariance.shape[1]
-        or not np.isfinite(covariance).all()
-    ):
+    is_square = covariance.ndim == 2 and len(covariance) == covariance.shape[1]
+    if not is_square or not np.isfinite(covariance).all():
         raise ConfigError(f"{place} has the shape {covariance.shape}; a square of finite numbers is required")
     variance = covariance.diagonal()
     if (variance < 0).any():

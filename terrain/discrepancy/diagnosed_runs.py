@@ -40,11 +40,12 @@ from terrain.discrepancy.search import Problem, names_of
 from terrain.discrepancy.verdict import INTERVAL_T, Diagnosis
 from terrain.effects import CHANNELS, Effect, parameters_of
 from terrain.errors import ConfigError, DataError
+from terrain.files.names import packaged
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 from terrain.simulation.plants.planar import Ground, planar_ground, probe_error, spread_numbers
-from terrain.terramechanics.soil import extra_soil_names, load_soil, soil_names
+from terrain.terramechanics.soil import EXTRA, load_soil, soil_names
 
 ACTS_RATIO = 0.25
 """Least part of the change of a channel by all causes, root mean square, that one of them makes to be named
@@ -247,7 +248,7 @@ def simulation_for(
     where they are known already.
     """
     labels = sorted({run.terrains[0] if len(run.terrains) == 1 else "" for run in runs})
-    known, grounds = {*soil_names(), *extra_soil_names()}, {}
+    known, grounds = {*soil_names(), *packaged(EXTRA)}, {}
     for label in labels:
         if label in known and drivable(robot, label):
             grounds[label] = planar_ground(robot, load_soil(label))

@@ -30,6 +30,7 @@ from terrain.errors import ConfigError
 from terrain.files.documents import check_keys, number, read_yaml
 from terrain.files.names import described_file, packaged
 
+EXTRA = "soils/extra"  #: Packaged soils that show an effect, and are no classes of labelled runs
 #: The numbers of each traction law.
 LAWS: dict[str, tuple[str, ...]] = {
     "janosi": ("cohesion_pa", "friction_angle_rad", "shear_modulus_m"),
@@ -115,24 +116,12 @@ def soil_names() -> tuple[str, ...]:
     return packaged("soils")
 
 
-def extra_soil_names() -> tuple[str, ...]:
-    """Return the names of soils that show an effect, and are no classes of labelled runs.
-
-    Examples
-    --------
-    >>> extra_soil_names()
-    ('digging_sand', 'toyoura_sand', 'wet_floor')
-    """
-    return packaged("soils/extra")
-
-
 def load_soil(name_or_path: str | Path) -> Soil:
     """Return a soil that travels with the package, by name, or the one that a YAML file describes.
 
     Parameters
     ----------
-    name_or_path : one of :func:`soil_names` or :func:`extra_soil_names`, or the path of a file that ends in
-        ``.yaml`` or ``.yml``
+    name_or_path : one of :func:`soil_names` or :data:`EXTRA`, or the path of a file that ends in ``.yaml`` or ``.yml``
 
     Raises
     ------
@@ -146,7 +135,7 @@ def load_soil(name_or_path: str | Path) -> Soil:
     >>> soil.law, soil.cohesion_pa
     ('janosi', 4140.0)
     """
-    path = described_file(name_or_path, "soil", "soils", "soils/extra")
+    path = described_file(name_or_path, "soil", "soils", EXTRA)
     return soil_from(path.name, read_yaml(path))
 
 
