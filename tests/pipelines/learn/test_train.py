@@ -108,6 +108,8 @@ def test_a_record_of_a_training_that_is_none_is_one_sentence(in_tracked, model_d
 def test_a_store_that_fails_in_the_middle_costs_no_model(runs, tracked, tmp_path, monkeypatch):
     for each in runs:
         write_run(each, tmp_path / "runs")
+    best = {"C": 10, "gamma": 0.4, "percentile": 100}  # a choice would take longer
+    (tmp_path / "best.json").write_text(json.dumps({"version": 1, "params": best}))
     monkeypatch.chdir(tracked[0])
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
 
@@ -117,10 +119,11 @@ def test_a_store_that_fails_in_the_middle_costs_no_model(runs, tracked, tmp_path
     usual = tracking._log_model
     monkeypatch.setattr(tracking, "_log_model", failing)
     sentence = (
-        r"has stopped; the model is kept in .*: register it by terrain train --register .*/kept --name field"
+        r"has stopped; the model is kept in .*: register it by terrain train --register .*/kept --name f"
     )
+    asked = {"data": tmp_path / "runs", "params": tmp_path / "best.json", "out": tmp_path / "kept"}
     with pytest.raises(TerrainError, match=sentence) as error:
-        run(Settings(data=tmp_path / "runs", name="field", out=tmp_path / "kept", repeats=1, n_jobs=1))
+        run(Settings(name="field", repeats=1, n_jobs=1, **asked))
     assert len(str(error.value).splitlines()) == 1
     monkeypatch.setattr(tracking, "_log_model", usual)
     asked = Settings(kept=tmp_path / "kept", name="kept")
