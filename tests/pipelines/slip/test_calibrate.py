@@ -37,13 +37,11 @@ def calibrated(tmp_path_factory):
 
 def test_the_hidden_truth_lies_in_the_intervals(calibrated):
     _, _, result = calibrated
-    found = [finding for finding in result.findings if finding.determined]
     inside = []
-    for finding in found:
+    for finding in result.findings:
         section, _, name = finding.parameter.partition(".")
-        if name:
-            true = getattr(getattr(HIDDEN, section), name)
-            inside.append(finding.low <= true <= finding.high)
+        if finding.determined and name:
+            inside.append(finding.low <= getattr(getattr(HIDDEN, section), name) <= finding.high)
             assert finding.low <= finding.value <= finding.high
             assert finding.n > 0
             assert finding.runs

@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -54,7 +53,7 @@ def learned(runs, tmp_path_factory):
 def without(run, stream, channel):
     removed = run.streams[stream]
     names = [name for name in removed.channels if name != channel]
-    kept = Stream(removed.time_s, np.column_stack([removed.channel(name) for name in names]), names)
+    kept = Stream(removed.time_s, removed.columns(names), names)
     return replace(run, streams={**run.streams, stream: kept})
 
 

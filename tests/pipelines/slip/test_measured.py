@@ -180,8 +180,8 @@ def test_what_a_session_costs_another_is_the_difference_that_was_hidden(runs, le
 def without_currents(run):
     wheels = run.streams["wheels"]
     names = [name for name in wheels.channels if not name.startswith("current")]
-    values = np.column_stack([wheels.channel(name) for name in names])
-    return replace(run, streams={**run.streams, "wheels": Stream(wheels.time_s, values, names)})
+    bare = Stream(wheels.time_s, wheels.columns(names), names)
+    return replace(run, streams={**run.streams, "wheels": bare})
 
 
 @pytest.mark.parametrize(("soil", "least"), [("dry_sand", 0.1), ("clay", 0.01)])
@@ -190,11 +190,8 @@ def test_slip_of_a_simulated_skid_steer_robot_is_that_of_its_truth(soil, least):
     driven = [simulate_run(husky, soil, "straight", 3, i, duration_s=12.0) for i in range(3)]
     truths = [run.streams["truth"] for run in driven]
     late = [truth.channel("slip_left_ratio")[truth.time_s > 6.0] for truth in truths]
-    truth = float(np.median(np.concatenate(late)))
-    for each, height in (
-        (driven, "thrust of a wheel over its load"),
-        (map(without_currents, driven), "surface"),
-    ):
+    truth, bare = float(np.median(np.concatenate(late))), map(without_currents, driven)
+    for each, height in ((driven, "thrust of a wheel over its load"), (bare, "surface")):
         table = learn_slip_table(each, husky)
         (row,) = table.surfaces.values()
         assert truth > least

@@ -60,7 +60,7 @@ def runs(draw):
 
 
 @given(runs())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_a_run_that_is_written_as_a_folder_and_as_messages_is_read_back(tmp_path_factory, run):
     try:
         folder = write_run(run, tmp_path_factory.mktemp("drawn"))

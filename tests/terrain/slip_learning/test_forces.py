@@ -136,9 +136,7 @@ def test_a_log_without_current_or_attitude_and_a_filter_without_slip_speeds_are_
         removed = streams.pop(stream)
         if channel is not None:
             left = tuple(name for name in left if name != channel)
-            streams[stream] = Stream(
-                removed.time_s, np.column_stack([removed.channel(each) for each in left]), left
-            )
+            streams[stream] = Stream(removed.time_s, removed.columns(left), left)
         bare = RunLog("bare", run.robot, streams, run.labels)
         with pytest.raises(DataError, match=f"run bare: stream '{stream}' has no channel '{channel or ''}"):
             wheel_forces(bare, ROBOT, found.track, found.table, found.slip)
