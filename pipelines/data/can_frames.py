@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
@@ -424,18 +424,10 @@ def read_run(path: Path, folder: Path, layout: Layout, robot: str, *, repair: bo
     """
     receiver = Receiver(layout, tuple(SIGNALS), most=math.inf)
     first_s: float | None = None
-    can = library("can")
-    reader, mode = READERS[path.suffix.lower()]
-    try:
-        with path.open(mode) as file:  # a reader that fails leaves a file of its own open
-            for frame in getattr(can, reader)(file):
-                first_s = frame.timestamp if first_s is None else first_s
-                frame.timestamp -= first_s
-                receiver.take(frame)
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:  # whatever a parser does with a damaged file
-        raise LogError(f"{path}: is no log of a CAN bus, or is damaged ({one_line(error)})") from error
+    for frame in _frames(path):
+        first_s = frame.timestamp if first_s is None else first_s
+        frame.timestamp -= first_s
+        receiver.take(frame)
     readings, dropped = receiver.readings(math.inf), receiver.dropped
     faults = {kind: n for kind, n in dropped.items() if kind not in USUAL}
     if faults and not repair:
@@ -460,3 +452,15 @@ def read_run(path: Path, folder: Path, layout: Layout, robot: str, *, repair: bo
     place = path.relative_to(folder).with_suffix("").parts
     labels = (whole_run_label(streams, place[0]),) if len(place) > 1 else ()
     return RunLog("_".join(place), robot, streams, labels, source=str(path), dropped=dropped)
+
+
+def _frames(path: Path) -> Iterator[Any]:
+    can = library("can")
+    reader, mode = READERS[path.suffix.lower()]
+    try:
+        with path.open(mode) as file:  # a reader that fails leaves a file of its own open
+            yield from getattr(can, reader)(file)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:  # whatever a parser does with a damaged file
+        raise LogError(f"{path}: is no log of a CAN bus, or is damaged ({one_line(error)})") from error

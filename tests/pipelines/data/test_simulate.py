@@ -49,6 +49,17 @@ def test_a_run_is_the_same_whatever_is_simulated_beside_it(tmp_path):
     assert len({run.streams["truth"].values.tobytes() for run in different}) == len(different)
 
 
+def test_conditions_scatter_more_than_noise_where_runs_vary():
+    slips = {}
+    for vary in (False, True):
+        runs = [
+            simulate_run(ROBOT, "grass", "straight", 0, k, duration_s=4.0, vary=vary) for k in range(1, 7)
+        ]
+        truths = [run.streams["truth"] for run in runs]
+        slips[vary] = [np.mean(truth.channel("slip_1_ratio")[truth.time_s > 3.0]) for truth in truths]
+    assert np.std(slips[True]) > 5 * np.std(slips[False])
+
+
 def test_options_reach_the_run(tmp_path):
     """A slope of 0.1 pitches the robot and pulls at it, a load adds to that, and the camera is lost for 2 s."""
     steps = []
