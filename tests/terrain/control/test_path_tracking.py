@@ -23,22 +23,21 @@ TWISTS = {
 TWIST = pytest.mark.parametrize("twist", [np.array(twist) for twist in TWISTS.values()], ids=TWISTS)
 
 
-def moved(pose, twist, dt_s=DT_S):
-    middle = pose[2] + 0.5 * dt_s * twist[2]
+def moved(pose, twist):
+    middle = pose[2] + 0.5 * DT_S * twist[2]
     velocity = complex(*twist[:2]) * complex(math.cos(middle), math.sin(middle))
-    return pose + dt_s * np.array([velocity.real, velocity.imag, twist[2]])
+    return pose + DT_S * np.array([velocity.real, velocity.imag, twist[2]])
 
 
-def step(state, twist, pose, ground=None, std=0.001, stale_s=0.0, dt_s=DT_S, settings=SETTINGS):
-    ground = twist if ground is None else ground
-    return track_step(settings, state, twist, pose, ground, std, stale_s, dt_s)
+def step(state, twist, pose, ground=None, std=0.001, stale_s=0.0, dt_s=DT_S):
+    return track_step(SETTINGS, state, twist, pose, twist if ground is None else ground, std, stale_s, dt_s)
 
 
-def drive(twist, pose, n, disturbance=(0.0, 0.0, 0.0), speed=1.0, settings=SETTINGS):
+def drive(twist, pose, n, disturbance=(0.0, 0.0, 0.0), speed=1.0):
     """Drive an ideal robot, slower and disturbed; (rows of report and command, state, pose)."""
     state, pose, rows, ground = TrackState(), np.array(pose), [], np.zeros(3)
     for _ in range(n):
-        command, state, report = step(state, twist, pose, ground, settings=settings)
+        command, state, report = step(state, twist, pose, ground)
         ground = speed * command + np.array(disturbance)
         pose = moved(pose, ground)
         rows.append([*report, *command])

@@ -5,9 +5,7 @@ import pytest
 
 from terrain.control.wheel_corrections import BridgeState, LastSample, corrections
 from terrain.records import Command, Reading
-from terrain.robots import load_robot
 
-ROBOT = load_robot("agrimaro")
 RADPS, STEER_RAD = np.full(3, 5.0), np.full(3, 0.2)
 
 

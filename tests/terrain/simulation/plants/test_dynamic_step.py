@@ -82,14 +82,13 @@ def wheels(motion):
     return motion.record["wheels"]
 
 
-def ramp(duration_s, radps=5.0, rise_s=1.0):
-    """Return equal wheel commands (n, 3) that rise to a rate in that time."""
-    rising = np.minimum(np.arange(round(duration_s * 50)) / 50 / rise_s, 1.0)
-    return np.repeat(radps * rising[:, None], 3, axis=1)
+def ramp(duration_s, radps=5.0):
+    """Return equal wheel commands (n, 3) that rise to a rate within a second."""
+    return np.repeat(radps * np.minimum(np.arange(round(duration_s * 50)) / 50, 1.0)[:, None], 3, axis=1)
 
 
-def steady_slip(plant, radps=5.0, duration_s=10.0):
-    return wheels(drive(plant, ramp(duration_s, radps), settled=True))["slip_ratio"][-1]
+def steady_slip(plant, duration_s):
+    return wheels(drive(plant, ramp(duration_s), settled=True))["slip_ratio"][-1]
 
 
 def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer_0=0.0):

@@ -30,10 +30,9 @@ def moved(speed, steer, roll=0.0, values=None, robot=CAR, dt=DT, grade=0.0, grou
     return np.column_stack([out[name] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")])
 
 
-def understeer(robot, added=0.0):
+def understeer(robot):
     a, b = robot.com_ahead_m, robot.com_behind_front_m
-    own = robot.mass_kg * (a / robot.front_cornering_npr - b / robot.rear_cornering_npr) / robot.wheelbase_m
-    return own + added
+    return robot.mass_kg * (a / robot.front_cornering_npr - b / robot.rear_cornering_npr) / robot.wheelbase_m
 
 
 def test_at_rest_it_rests_and_creeping_it_is_the_kinematic_bicycle():

@@ -37,9 +37,9 @@ def centred(robot):
     return robot.with_parts(body=replace(robot.body, com_x_m=0.0, com_y_m=0.0))
 
 
-def moved(robot, ground, wheels, p=NONE, grade=0.0, dt=DT):
-    n = len(wheels)
-    return move(make_planar(robot, ground), p, dt, wheels, np.zeros((n, 3)), np.full(n, grade), np.zeros(n))
+def moved(robot, ground, wheels, p=NONE):
+    level = np.zeros(len(wheels))
+    return move(make_planar(robot, ground), p, DT, wheels, np.zeros((len(wheels), 3)), level, level)
 
 
 def twists(truth):
@@ -76,8 +76,8 @@ def test_steady_motion_is_that_of_the_balance_of_forces(ratio, direction_rad):
     assert found[2] == pytest.approx(expected[2], abs=1e-4 + inside / ROBOT.wheel_distance_m)
 
 
-def starting(n=60):
-    ramp = np.minimum(np.arange(n) / 20.0, 1.0)[:, None]
+def starting():
+    ramp = np.minimum(np.arange(60) / 20.0, 1.0)[:, None]
     return ramp * np.array([0.15, 0.1, 0.6]) @ rolling_matrix(*PLACE).T
 
 
@@ -121,11 +121,10 @@ def test_currents_are_those_of_friction_where_nothing_resists_and_grow_with_the_
     assert held["current_a"][-1] > free["current_a"][-1] + 0.5
 
 
-def driven(direction_rad, seed=0, ground=CARPET, speed_mps=0.2, seconds=6.0, effects=None):
-    twist = np.zeros((int(50 * seconds) + 1, 3))
-    twist[25:] = heading_to(direction_rad, speed_mps)
-    noise = spread_numbers("noise")
-    run = simulate(ROBOT, twist, ground, seed, noise=noise, terrain="carpet", effects=effects)
+def driven(direction_rad):
+    twist = np.zeros((301, 3))
+    twist[25:] = heading_to(direction_rad)
+    run = simulate(ROBOT, twist, CARPET, 0, noise=spread_numbers("noise"), terrain="carpet")
     return with_wheel_speeds(run, ROBOT)
 
 

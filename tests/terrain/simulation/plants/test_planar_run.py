@@ -35,12 +35,12 @@ HILLS = Conditions(grade_ratio=(0.04, -0.03), undulation_ratio=0.04)
 NOISE, SCATTER = spread_numbers("noise"), spread_numbers("scatter")
 
 
-def drive(robot, scenario="complex", length_s=60.0, speed_mps=0.6):
+def drive(robot):
     if robot is CAR:
         t = 0.02 * np.arange(1501)
         speed = 1.5 * np.sin(0.5 * t) ** 2
         return np.column_stack([speed, np.zeros_like(t), 0.3 * speed * np.sin(0.9 * t)])
-    return make_scenario(scenario, robot, "grass", length_s, speed_mps, seed=1).twist
+    return make_scenario("complex", robot, "grass", 60.0, 0.6, seed=1).twist
 
 
 def steady(speed_mps, length_s, turn_radps=0.0):
