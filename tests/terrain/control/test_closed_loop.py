@@ -40,19 +40,25 @@ class Loop:
         return self.control.step(*now, self.belief, OutputStatus.NONE, holds=True)[0]
 
 
-def history(name, scenario, terrain, seed, **options):
-    """The history of a drive of that controller."""
+def history(name, scenario, terrain, seed, until_s=math.inf, **options):
+    """The history of a drive of that controller, up to a time."""
     where = make_situation(scenario, ROBOT, terrain, seed, SituationOptions(**options))
+    within = where.scenario.time_s <= until_s
+    time_s, twist = where.scenario.time_s[within], where.scenario.twist[within]
+    where = where._replace(scenario=replace(where.scenario, time_s=time_s, twist=twist))
     run = simulate_situation(ROBOT, where, Loop(name).step, DELAY_S)
     return drive_history(run, ROBOT, where.conditions.radius_factors)
 
 
 def test_a_start_on_grass_slips_less_and_travels_nearly_as_far():
-    plain, limited = (history(name, "starts", "grass", 200) for name in ("plain", "known:grass"))
-    for start_s in start_times(make_situation("starts", ROBOT, "grass", 200).scenario)[1:]:
-        within = (plain.time_s >= start_s) & (plain.time_s < start_s + 7)
-        assert slip_peak(plain, within) > 1.5 * slip_peak(limited, within)
-        assert distance_within(limited, start_s, 5.0) > 0.85 * distance_within(plain, start_s, 5.0)
+    """The second, of which the slip of steady motion is known."""
+    start_s = start_times(make_situation("starts", ROBOT, "grass", 200).scenario)[1]
+    plain, limited = (
+        history(name, "starts", "grass", 200, until_s=start_s + 7.0) for name in ("plain", "known:grass")
+    )
+    within = plain.time_s >= start_s
+    assert slip_peak(plain, within) > 1.5 * slip_peak(limited, within)
+    assert distance_within(limited, start_s, 5.0) > 0.85 * distance_within(plain, start_s, 5.0)
 
 
 def test_wheels_of_unequal_radius_do_not_work_against_each_other_in_a_circle_on_tiles():
