@@ -46,20 +46,14 @@ def write_trials(path, seed=0):
     return path
 
 
-@pytest.fixture(scope="module")
-def fitted(tmp_path_factory):
-    """The command over trials that are also those to check on: its folder, its JSON, and its screen."""
-    folder = tmp_path_factory.mktemp("soil")
-    data, out = str(write_trials(folder / "bed")), str(folder / "out")
-    words = ["--data", data, "--check", data, "--out", out, "--figures", out, "--draws", "2"]
-    words += ["--laws", "simulator,wong_reece", "--json", str(folder / "soil.json")]
+def test_the_law_that_made_the_trials_holds_on_what_was_left_out(tmp_path):
+    """The command over trials that are also those to check on."""
+    data, out = str(write_trials(tmp_path / "bed")), tmp_path / "out"
+    words = ["--data", data, "--check", data, "--out", str(out), "--figures", str(out), "--draws", "2"]
+    words += ["--laws", "simulator,wong_reece", "--json", str(tmp_path / "soil.json")]
     done = CliRunner().invoke(app, ["calibrate", "--what", "soil", *words])
     assert done.exception is None, done.output
-    return folder / "out", json.loads((folder / "soil.json").read_text()), done.output
-
-
-def test_the_law_that_made_the_trials_holds_on_what_was_left_out(fitted):
-    out, result, screen = fitted
+    result, screen = json.loads((tmp_path / "soil.json").read_text()), done.output
     (wheel,) = result["wheels"]
     simulator, wong_reece = wheel["laws"]
     assert (wheel["wheel"], wheel["n_trials"], wheel["n_settings"]) == ("smooth", 25, 25)
@@ -72,12 +66,8 @@ def test_the_law_that_made_the_trials_holds_on_what_was_left_out(fitted):
     assert "Cohesion against friction" in wheel["not_identified"][0]
     assert "25 further trials" in screen
     assert sorted(map(str, out.iterdir())) == sorted(result["files"])
-
-
-def test_the_soil_is_one_that_the_simulator_takes(fitted):
-    out, result, _ = fitted
-    soil, file = load_soil(out / "testbed_sand_smooth.yaml"), result["wheels"][0]["soil"]
-    assert soil.name == "testbed_sand_smooth"
-    assert soil.kphi_npmn2 == pytest.approx(file["fit"]["values"]["kphi_npmn2"], rel=1e-3)
+    # the soil is one that the simulator takes
+    soil, kphi = load_soil(out / "testbed_sand_smooth.yaml"), wheel["soil"]["fit"]["values"]["kphi_npmn2"]
+    assert (soil.name, soil.kphi_npmn2) == ("testbed_sand_smooth", pytest.approx(kphi, rel=1e-3))
     text = (out / "testbed_sand_smooth.yaml").read_text()
     assert (text.count("assumed"), text.count("95 %")) == (5, 4)

@@ -51,7 +51,7 @@ def test_a_hidden_slip_model_comes_back_within_its_own_error(legs):
 
 
 def test_slip_that_is_known_beats_slip_that_is_not_on_runs_held_out(legs):
-    ends = held_out_ends({"2 s": legs}, PATAKO, 4, 0)
+    ends = held_out_ends({"2 s": legs}, PATAKO, 3, 0)
     scores = score_legs(legs, {name: by["2 s"] for name, by in ends.items()}, 0)
     by_name = {kind.kind: kind for kind in scores.kinds}
     assert by_name[ENDO.name].gain_gyro > 0.5
