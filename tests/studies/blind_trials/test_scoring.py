@@ -48,10 +48,6 @@ TWINS = replace(SILENT, verdict=Verdict.AMBIGUOUS, sets=(("payload", "motor_cons
 REFUSED = replace(SILENT, verdict=Verdict.REFUSED, refusal="runs: only 2 of 8 are fit")
 
 
-def counted(trials):
-    return {name: (one.hits, one.of, one.met) for name, one in table_of(trials).items()}
-
-
 @pytest.mark.parametrize(("k", "n"), [(0, 300), (1, 100), (3, 7), (97, 100), (20, 20)])
 def test_a_rate_has_the_interval_of_clopper_and_pearson(k, n):
     one = score([True] * k + [False] * (n - k))
@@ -148,106 +144,69 @@ KNOWN = of(
     intervals={TRACK_RATIO: (1.6, 1.5, 1.7)},
 )
 BOTH = of(Row.TWO, causes=("payload", "scrub"), named=("scrub", "payload"))
-DYNAMIC_ANSWERS = [RIGHT, replace(RIGHT, intervals=OFF), TWINS, SILENT]
+TRIALS = [
+    *[replace(t, row=Row.SHORT) for t in (RIGHT, TWINS, SILENT, WRONG, BESIDE, REFUSED)],
+    *([of(Row.GROSS)] * 85 + [of(Row.GROSS, SILENT)] * 13 + [of(Row.GROSS, WRONG)] * 2),
+    *(LATE, STATED, replace(STATED, named=())),
+    *(SCATTERED, replace(SCATTERED, intervals=OFF)),
+    *(STALLED, replace(STALLED, excluded=("run_02", "run_07"))),
+    *(VARIES, replace(VARIES, present=("a", "c")), HALF),
+    *(DEG, FAULT, replace(FAULT, named=(TRACK,))),
+    *([DYNAMIC] * 57 + [replace(DYNAMIC, verdict=Verdict.REFUSED)] * 3),
+    *[of(Row.DYNAMIC, t) for t in (RIGHT, replace(RIGHT, intervals=OFF), TWINS, SILENT)],
+    *(
+        KNOWN,
+        replace(KNOWN, intervals={TRACK_RATIO: (1.7, 1.4, 2.0)}),
+        replace(KNOWN, named=(TRACK, "scrub")),
+    ),
+    *([QUIET] * 99 + [replace(QUIET, verdict=Verdict.UNEXPLAINED)]),
+    *([of(Row.STRONG)] * 96 + [of(Row.STRONG, intervals=OFF), of(Row.STRONG, WRONG)]),
+    *([of(Row.LADDER, over_limit=0.5)] + [of(Row.LADDER)] * 2),
+    of(Row.OUTSIDE, QUIET, outside=OUTSIDE[0], named=("wheel_radius",)),
+    of(Row.OUTSIDE, QUIET, outside=OUTSIDE[2], unexplained=(("current_a", "time"),)),
+    of(Row.POOR, TWINS),
+    *(BOTH, replace(BOTH, named=("payload",))),
+]
+COUNTS = {
+    "short: right or its twin set": (2, 6, False),
+    "short: a wrong single name": (2, 6, False),
+    "gross: right or its twin set": (85, 100, True),
+    "gross: a wrong single name": (2, 100, True),
+    "late: delay found": (2, 3, True),
+    "late: effect beside it found": (2, 3, True),
+    "scattered: mean value inside its 95 % interval": (1, 2, True),
+    "stalled: all stalled runs excluded": (1, 2, True),
+    "stalled: another run excluded": (1, 2, True),
+    "half: groups of runs are right": (1, 2, True),
+    "fault: stated in words": (1, 3, False),
+    "fault: a wrong single name": (1, 3, False),
+    "fault, gyro_deg: stated": (1, 3, True),
+    "dynamic, nothing hidden: something stated": (3, 60, True),
+    "dynamic, wheel radius: named or in its set": (3, 4, False),
+    "dynamic, wheel radius: true value inside": (1, 3, False),
+    "known, late: named, value within 5 %": (2, 3, False),
+    "known, late: a wrong single name": (1, 3, False),
+    "known, plain: a wrong single name": None,
+    "none: false alarms": (1, 100, True),
+    "strong: named": (97, 98, True),
+    "strong: wrongly named": (1, 98, False),
+    "ladder: wrongly named": (0, 3, True),
+    # of effects over the limit that were named: 96 and 1 of the strong row, 2 of the ladder
+    "value inside its 95 % interval": (98, 99, False),
+    "two: both, and only both": (1, 2, False),
+    "outside: confidently misnamed": (1, 2, False),
+    "outside: called unexplained": (1, 2, False),
+    f"outside, {OUTSIDE[0]}: misnamed": (1, 1, True),
+    f"outside, {OUTSIDE[1]}: misnamed": None,
+    f"outside, {OUTSIDE[2]}: unexplained": (1, 1, True),
+    "poor: a wrong single name": (0, 1, True),
+    "poor: ambiguous or not excited": (1, 1, True),
+}
 
 
-@pytest.mark.parametrize(
-    ("trials", "counts"),
-    [
-        (
-            [replace(t, row=row) for t in (RIGHT, TWINS, SILENT, WRONG, BESIDE, REFUSED)],
-            {
-                f"{row.value}: right or its twin set": (2, 6, False),
-                f"{row.value}: a wrong single name": (2, 6, False),
-            },
-        )
-        for row in (Row.GROSS, Row.SHORT, Row.SENSOR_LATE)
-    ]
-    + [
-        (
-            [*[of(Row.GROSS)] * 85, *[of(Row.GROSS, SILENT)] * 13, *[of(Row.GROSS, WRONG)] * 2],
-            {"gross: right or its twin set": (85, 100, True), "gross: a wrong single name": (2, 100, True)},
-        ),
-        (
-            [LATE, STATED, replace(STATED, named=())],
-            {"late: delay found": (2, 3, True), "late: effect beside it found": (2, 3, True)},
-        ),
-        (
-            [SCATTERED, replace(SCATTERED, intervals=OFF)],
-            {"scattered: mean value inside its 95 % interval": (1, 2, True)},
-        ),
-        (
-            [STALLED, replace(STALLED, excluded=("run_02", "run_07"))],
-            {
-                "stalled: all stalled runs excluded": (1, 2, True),
-                "stalled: another run excluded": (1, 2, True),
-            },
-        ),
-        (
-            [VARIES, replace(VARIES, present=("a", "c")), HALF],
-            {"half: groups of runs are right": (1, 2, True)},
-        ),
-        (
-            [DEG, FAULT, replace(FAULT, named=(TRACK,))],
-            {
-                "fault: stated in words": (1, 3, False),
-                "fault: a wrong single name": (1, 3, False),
-                "fault, gyro_deg: stated": (1, 3, True),
-            },
-        ),
-        (
-            [*[DYNAMIC] * 57, *[replace(DYNAMIC, verdict=Verdict.REFUSED)] * 3]
-            + [of(Row.DYNAMIC, t) for t in DYNAMIC_ANSWERS],
-            {
-                "dynamic, nothing hidden: something stated": (3, 60, True),
-                "dynamic, wheel radius: named or in its set": (3, 4, False),
-                "dynamic, wheel radius: true value inside": (1, 3, False),
-            },
-        ),
-        (
-            [
-                KNOWN,
-                replace(KNOWN, intervals={TRACK_RATIO: (1.7, 1.4, 2.0)}),
-                replace(KNOWN, named=(TRACK, "scrub")),
-            ],
-            {
-                "known, late: named, value within 5 %": (2, 3, False),
-                "known, late: a wrong single name": (1, 3, False),
-                "known, plain: a wrong single name": None,
-            },
-        ),
-        (
-            [
-                *([QUIET] * 99 + [replace(QUIET, verdict=Verdict.UNEXPLAINED)]),
-                *([of(Row.STRONG)] * 96 + [of(Row.STRONG, intervals=OFF), of(Row.STRONG, WRONG)]),
-                *([of(Row.LADDER, over_limit=0.5)] + [of(Row.LADDER)] * 2),
-                of(Row.OUTSIDE, QUIET, outside=OUTSIDE[0], named=("wheel_radius",)),
-                of(Row.OUTSIDE, QUIET, outside=OUTSIDE[2], unexplained=(("current_a", "time"),)),
-                of(Row.POOR, TWINS),
-                *(BOTH, replace(BOTH, named=("payload",))),
-            ],
-            {
-                "none: false alarms": (1, 100, True),
-                "strong: named": (97, 98, True),
-                "strong: wrongly named": (1, 98, False),
-                "ladder: wrongly named": (0, 3, True),
-                # of effects over the limit that were named: 96 and 1 of the strong row, 2 of the ladder
-                "value inside its 95 % interval": (98, 99, False),
-                "two: both, and only both": (1, 2, False),
-                "outside: confidently misnamed": (1, 2, False),
-                "outside: called unexplained": (1, 2, False),
-                f"outside, {OUTSIDE[0]}: misnamed": (1, 1, True),
-                f"outside, {OUTSIDE[1]}: misnamed": None,
-                f"outside, {OUTSIDE[2]}: unexplained": (1, 1, True),
-                "poor: a wrong single name": (0, 1, True),
-                "poor: ambiguous or not excited": (1, 1, True),
-            },
-        ),
-    ],
-)
-def test_the_table_counts_outcomes_by_row(trials, counts):
-    table = counted(trials)
-    assert {name: table.get(name) for name in counts} == counts
+def test_the_table_counts_outcomes_by_row():
+    counted = {name: (one.hits, one.of, one.met) for name, one in table_of(TRIALS).items()}
+    assert {name: counted.get(name) for name in COUNTS} == COUNTS
 
 
 def test_the_amplitude_from_which_nine_in_ten_are_found_is_recovered():

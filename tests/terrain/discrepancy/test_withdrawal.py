@@ -72,18 +72,14 @@ def test_a_value_at_its_bound(hide, pose, solve):
     rest = solve(half)
     assert rest.change[0] == pytest.approx(0.49 * high, rel=0.1)
     assert "at the bound" in reason(half, rest)
-
-
-@pytest.mark.parametrize(
-    ("value", "at_bound"), [(-0.045, False), (-0.0495, True), (0.45, False), (0.495, True)]
-)
-def test_a_bound_near_zero_has_an_edge_of_its_own(value, at_bound):
+    # one that is near zero has an edge of its own
     effect = effect_named("rolling_resistance")
     names = tuple(p.name for p in effect.parameters)
     assert BOUNDS[names[0]] == (-0.05, 0.5)
-    fit = SimpleNamespace(names=names, change=np.array([value]))
     problem = SimpleNamespace(simulation=SimpleNamespace(effects={}))
-    assert bool(diagnose._at_bound(problem, fit, effect)) == at_bound
+    for value, at_bound in ((-0.045, False), (-0.0495, True), (0.45, False), (0.495, True)):
+        fit = SimpleNamespace(names=names, change=np.array([value]))
+        assert bool(diagnose._at_bound(problem, fit, effect)) == at_bound
 
 
 def test_an_input_that_gains_much_beside_it_and_looks_like_it(yaw):
