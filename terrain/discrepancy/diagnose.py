@@ -288,7 +288,9 @@ def _withdraw(
 def _probes(problem: Problem, fit: CauseFit) -> dict[tuple[str, str], ProbeResult]:
     """Return the probes of the residual, those of a tilt that is only in part a slope left out."""
     results = probe_residuals(fit.info, fit.names, fit.change, problem.simulation.probe_error)
-    if all(problem.simulation.tilt_is_slope(run.terrain) for run in problem.signals):
+    simulation = problem.simulation
+    grounds = [simulation.grounds.get(run.terrain, simulation.ground) for run in problem.signals]
+    if all(ground.effective_ratio >= 1.0 for ground in grounds):
         return results
     return {at: probe for at, probe in results.items() if at[1] not in TILT_INPUTS}
 

@@ -180,7 +180,7 @@ def _drives(
         for grade_deg in GRADES_DEG[:1] if robot.on_omni_wheels else GRADES_DEG:  # those log no tilt
             grade = roll = level
             if grade_deg:
-                flat = move(simulation.planar, simulation.vector, dt_s, speed, steer, level, level)
+                flat = move(simulation.planar_on(""), simulation.vector, dt_s, speed, steer, level, level)
                 yaw, steepness = (
                     np.cumsum(flat["yaw_rate_radps"]) / CLOCK_HZ,
                     math.tan(math.radians(grade_deg)),

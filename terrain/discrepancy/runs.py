@@ -84,18 +84,9 @@ class Simulation:
         """Effects that apply to this robot."""
         return library_of(self.robot.drive)
 
-    @property
-    def planar(self) -> Planar:
-        """Numbers for the kernels, on the default terrain."""
-        return make_planar(self.robot, self.ground)
-
     def planar_on(self, terrain: str) -> Planar:
-        """Return the numbers for the kernels on the terrain of a label."""
+        """Return the numbers for the kernels on the terrain of a label, the default one for all others."""
         return make_planar(self.robot, self.grounds.get(terrain, self.ground))
-
-    def tilt_is_slope(self, terrain: str) -> bool:
-        """Return whether all of the measured tilt on the terrain of a label counts as a slope."""
-        return self.grounds.get(terrain, self.ground).effective_ratio >= 1.0
 
     @property
     def known_scatter(self) -> dict[str, float]:

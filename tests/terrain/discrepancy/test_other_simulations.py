@@ -125,7 +125,7 @@ def test_a_run_is_simulated_on_the_soil_of_its_label_or_the_default_terrain():
     on = [simulation.planar_on("grass"), simulation.planar_on("moon"), make_planar(AGRIMARO, Ground())]
     grass, moon, plain = (planar.params.tobytes() for planar in on)
     assert grass == make_planar(AGRIMARO, simulation.grounds["grass"]).params.tobytes() != plain
-    assert moon == simulation.planar.params.tobytes() == plain
+    assert moon == simulation.planar_on("").params.tobytes() == plain
     assert simulation_for(unknown, AGRIMARO, LIBRARY)[0].grounds == {}
 
 
@@ -134,4 +134,3 @@ def test_tilt_acts_as_a_slope_but_not_where_a_body_rides_over_bumps(robot, effec
     runs = dynamic_runs(robot=robot, n=2, vary=robot is HUSKY, duration_s=40.0)
     simulation, _ = simulation_for(runs, robot, library_of(robot.drive))
     assert simulation.grounds["grass"].effective_ratio == pytest.approx(effective, abs=0.05)
-    assert simulation.tilt_is_slope("grass") == (simulation.grounds["grass"].effective_ratio == 1.0)

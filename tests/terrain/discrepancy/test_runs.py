@@ -227,7 +227,8 @@ def test_the_right_effects_leave_a_small_residual_and_none_a_large_one(looked_at
     simulation, effects, signals = looked_at
     low_pass = low_pass_of([signals])
     right, wrong = (
-        rows_of(signals, simulation.planar, vector_of(values), (), low_pass) for values in (effects, {})
+        rows_of(signals, simulation.planar_on(""), vector_of(values), (), low_pass)
+        for values in (effects, {})
     )
     there = np.isfinite(right.residual).any(axis=0)
     left, much = (np.sqrt(np.nanmean((r.residual / NOISE)[:, there] ** 2, axis=0)) for r in (right, wrong))
@@ -242,14 +243,16 @@ def test_sensitivities_are_differences_of_full_replays(looked_at):
     low_pass, point = low_pass_of([signals])._replace(instrument_cutoff_hz=np.inf), vector_of(effects)
     names = [p.name for effect in simulation.library for p in effect.parameters][::2]
     names += ["pitch_offset_rad", "roll_offset_rad"]
-    rows = rows_of(signals, simulation.planar, point, names, low_pass)
+    rows = rows_of(signals, simulation.planar_on(""), point, names, low_pass)
     for name, change in zip(names, rows.sensitivity, strict=True):
         step = STEPS[name]
         ahead, back = point.copy(), point.copy()
         ahead[INDEX[name]] += step
         if name not in ONE_SIDED:
             back[INDEX[name]] -= step
-        far, near = (rows_of(signals, simulation.planar, p, (), low_pass).predicted for p in (ahead, back))
+        far, near = (
+            rows_of(signals, simulation.planar_on(""), p, (), low_pass).predicted for p in (ahead, back)
+        )
         expected = (far - near) / (ahead - back)[INDEX[name]]
         assert_allclose(change, expected, atol=1e-9 * np.nanmax(np.abs(expected)) + 1e-12, err_msg=name)
 
@@ -259,15 +262,15 @@ def test_measured_and_predicted_pass_the_same_window(looked_at):
     simulation, effects, signals = looked_at
     low_pass = low_pass_of([signals])
     dt, wheel_speed, steer, grade, roll, _ = prepare_inputs(signals, low_pass)
-    shown = replay(simulation.planar, vector_of(effects), dt, wheel_speed, steer, grade, roll)
+    shown = replay(simulation.planar_on(""), vector_of(effects), dt, wheel_speed, steer, grade, roll)
     own = low_pass._replace(inputs_every=0)
     fed = {"wheel_speed_mps": wheel_speed, "steer_rad": steer, "grade_rad": grade, "roll_rad": roll}
     same = replace(signals, dt_s=dt, measured=shown, **fed)
-    rows = rows_of(same, simulation.planar, vector_of(effects), (), own)
+    rows = rows_of(same, simulation.planar_on(""), vector_of(effects), (), own)
     assert_array_equal(rows.measured, rows.predicted)
     holes = shown.copy()
     holes[300:320] = holes[500:503] = np.nan
-    rows = rows_of(replace(same, measured=holes), simulation.planar, vector_of(effects), (), own)
+    rows = rows_of(replace(same, measured=holes), simulation.planar_on(""), vector_of(effects), (), own)
     known = np.isfinite(rows.residual)
     assert 0.8 < known.mean() < 1.0
     assert_allclose(rows.residual[known], 0.0, atol=1e-12)
@@ -303,7 +306,7 @@ def test_a_hole_stays_unknown_and_nothing_else_is_lost(looked_at):
     wheel_speed[(time_s > 15.0) & (time_s < 16.0)] = np.nan
     holes = replace(signals, measured=measured, wheel_speed_mps=wheel_speed)
     rows, before = (
-        rows_of(run, simulation.planar, point, ["payload_ratio"], low_pass) for run in (holes, signals)
+        rows_of(run, simulation.planar_on(""), point, ["payload_ratio"], low_pass) for run in (holes, signals)
     )
     assert np.isnan(rows.measured[(rows.time_s > 8.3) & (rows.time_s < 10.7), c]).all()
     assert np.isnan(rows.measured[(rows.time_s > 15.3) & (rows.time_s < 15.7)]).all()
@@ -364,6 +367,6 @@ def test_the_start_of_a_short_run_is_kept_where_it_begins_in_steady_motion(secon
     wheel_speed[:, 0] += 0.3 * np.clip(run.time_s / 0.3, 0.0, 1.0) * moving
     low_pass = low_pass_of([run])
     cut = replace(run, wheel_speed_mps=wheel_speed)
-    rows = rows_of(cut, Simulation(HUSKY).planar, vector_of({}), (), low_pass)
+    rows = rows_of(cut, Simulation(HUSKY).planar_on(""), vector_of({}), (), low_pass)
     centre_s = low_pass.taps.size // 2 * cut.dt_s * max(low_pass.inputs_every, 1)
     assert rows.time_s[0] == pytest.approx(centre_s + lost_s, abs=1.0 / low_pass.rate_hz)
