@@ -53,10 +53,9 @@ from terrain.logs.samples import (
     refuse_apart,
     refuse_or_count,
     short_name,
-    to_si,
     whole_run_label,
 )
-from terrain.logs.schema import UNIT_SCALES, canonical_unit, check_unit, unit_of
+from terrain.logs.schema import UNIT_OFFSETS, UNIT_SCALES, canonical_unit, check_unit, unit_of
 from terrain.logs.tables import MAX_VALUES, TextLayout, read_table, row_number
 from terrain.records import Array, Label, RunLog, Stream
 
@@ -89,8 +88,10 @@ class Source(Strict):
     offset: FiniteFloat = 0.0
 
     def si(self, numbers: Array, unit: str) -> Array:
-        """Return numbers, which are in a unit once they are scaled, in the SI unit."""
-        return to_si(numbers, unit, self.scale, self.offset)
+        """Return numbers, which are in a unit once they are scaled, in the SI unit; what overflows is not finite."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            scaled = (numbers * self.scale + self.offset) * UNIT_SCALES[unit][1]
+            return np.asarray(scaled + UNIT_OFFSETS.get(unit, 0.0))
 
 
 class Column(Source):

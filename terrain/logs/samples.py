@@ -27,7 +27,6 @@ from terrain.files.names import (
     normal_name,
     shown,
 )
-from terrain.logs.schema import UNIT_OFFSETS, UNIT_SCALES
 from terrain.records import Array, Label, RunLog, Stream
 
 MAX_MAGNITUDE = 1e12
@@ -43,13 +42,6 @@ SHORT_ROW = "rows with missing or extra cells"
 DEAD_CHANNEL = "channels with nothing finite"
 IMPLAUSIBLE = "values beyond any quantity"
 RESPELT = "labels in another spelling of their terrain"
-
-
-def to_si(numbers: Array, unit: str, scale: float = 1.0, offset: float = 0.0) -> Array:
-    """Return ``scale * number + offset``, which is in a unit, in the SI unit; what overflows is not finite."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        si: Array = (numbers * scale + offset) * UNIT_SCALES[unit][1] + UNIT_OFFSETS.get(unit, 0.0)
-    return si
 
 
 def refuse_or_count(repairs: Counter[str] | None, kind: str, sentence: str, n: int = 1) -> None:

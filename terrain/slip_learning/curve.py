@@ -43,7 +43,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import ndtr, ndtri, stdtrit
@@ -201,7 +201,18 @@ def fit_curve(law: str, runs: Sequence[RunBins], start: Sequence[float] | None =
     pooled = _Pooled(runs)
     low, high = (np.array(bound) for bound in LAW_BOUNDS[law])
     rows, best, least = list(zip(LAW_PARAMETERS[law], *LAW_BOUNDS[law], strict=True)), (), math.inf
-    for guess in _starts(law, pooled) if start is None else [np.asarray(start)]:
+    guesses: list[Any] = [start]
+    if start is None:
+        top = max(float(np.quantile(pooled.traction, 0.95)), 0.02)
+        reach = max(float(np.max(pooled.slip)), 0.05)
+        guesses = [[top * scale, reach * part] for scale, part in ((1.2, 0.05), (1.5, 0.3), (3.0, 1.0))]
+        if law == "magic":
+            guesses = [
+                [math.tan(math.pi / (2 * shape)) / (reach * part), shape, top, curvature]
+                for part in (0.2, 0.5, 1.0)
+                for shape, curvature in ((1.4, 0.0), (1.9, 0.9))
+            ]
+    for guess in guesses:
         theta = np.clip(guess, low + 1e-6, high - 1e-6)
         variance = pooled.std**2 if start is None else pooled.variance(law, theta)
         for _ in range(3 if start is None else 1):
@@ -217,20 +228,6 @@ def fit_curve(law: str, runs: Sequence[RunBins], start: Sequence[float] | None =
         if (cost := pooled.cost(law, theta)) < least or not best:
             best, least = tuple(theta.tolist()), cost
     return best
-
-
-def _starts(law: str, pooled: _Pooled) -> list[Array]:
-    top = max(float(np.quantile(pooled.traction, 0.95)), 0.02)
-    reach = max(float(np.max(pooled.slip)), 0.05)
-    if law == "janosi":
-        return [
-            np.array([top * scale, reach * part]) for scale, part in ((1.2, 0.05), (1.5, 0.3), (3.0, 1.0))
-        ]
-    return [
-        np.array([math.tan(math.pi / (2 * shape)) / (reach * part), shape, top, curvature])
-        for part in (0.2, 0.5, 1.0)
-        for shape, curvature in ((1.4, 0.0), (1.9, 0.9))
-    ]
 
 
 def select_law(runs: Sequence[RunBins]) -> tuple[str, tuple[float, ...], dict[str, Array]]:
