@@ -98,8 +98,7 @@ def test_a_set_of_causes_is_not_reached_twice(three, monkeypatch):
     [
         # halfway through a run an offset and a rate of a clock add up to nothing: they are found as a pair
         ({"clock_offset_s": 0.06, "clock_rate_ratio": -0.003}, None, {}),
-        # far off together, from nowhere and from a lag that is known
-        ({"camera_latency_s": 0.25, TRACK: 1.5}, "camera_yaw lever_arm gyro_scale", {}),
+        # far off together, from a lag that is known
         (
             {"camera_latency_s": 0.25, TRACK: 1.5},
             "camera_yaw lever_arm gyro_scale",
@@ -110,7 +109,7 @@ def test_a_set_of_causes_is_not_reached_twice(three, monkeypatch):
         # half a track, which straight lines take for less than none
         ({TRACK: -0.45}, None, {}),
     ],
-    ids=["pair", "far", "seeded", "wrong seed", "bound"],
+    ids=["pair", "seeded", "wrong seed", "bound"],
 )
 def test_what_is_hidden_is_found_from_where_straight_lines_mislead(posed, solve, hidden, library, seeds):
     causes = {next(e.name for e in LIBRARY if name in names_of([e])) for name in hidden}
