@@ -202,6 +202,17 @@ def test_the_unit_of_wheels_is_not_judged_by_the_currents():
     assert rivals == []
 
 
+def test_a_unit_of_the_wheels_says_nothing_of_currents():
+    """They are not in proportion to the speeds of the wheels, and all else is."""
+    changes, adds = options_of(np.zeros((1, len(KEYS))), AGRIMARO)
+    wheels = [k for k, reading in enumerate(changes) if any(change.of_wheels for change in reading)]
+    others = [place for place, channel in enumerate(KEYS) if channel != AMPS]
+    assert wheels
+    assert np.isnan(np.delete(adds[wheels], others, axis=1)).all()
+    factors = [np.log(change.factor) for k in wheels for change in changes[k]]
+    assert_allclose(adds[wheels][:, others], -np.tile(factors, (len(others), 1)).T)
+
+
 def test_a_heading_says_whether_the_gyro_or_the_wheels_are_turned():
     runs = [with_lidar(run, 0.0) for run in sound(wide=True)]
     (gyro,) = faults(on_one_clock([WRITTEN["the gyro's sign"][0](run) for run in runs]))
