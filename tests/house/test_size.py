@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MAX_LINES = {"terrain": 46_350, "features": 2_310, "pipelines": 17_600, "tests": 43_100}
+MAX_LINES = {"terrain": 45_250, "features": 2_300, "pipelines": 17_400, "tests": 39_400}
 """Lines of Python, docstrings included."""
 
 

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -84,14 +85,16 @@ class Scripted:
     certain = settled = False
 
     def __init__(self, terrain, probability):
-        self.output, self.n_refused, self.next_s = (terrain, probability), 0, 2.0
+        self.output, self.outputs, self.next_s = (terrain, probability), [], 2.0
 
     def update(self, sample, estimates):
+        self.outputs = []
         if sample.time_s < self.next_s:
             return []
         self.next_s += 2.0
-        self.n_refused += self.next_s == 6.0
-        return [TerrainEstimate(sample.time_s, *self.output)] if self.next_s != 6.0 else []
+        refused = "refused" if self.next_s == 6.0 else ""
+        self.outputs = [SimpleNamespace(refused=refused)]
+        return [] if refused else [TerrainEstimate(sample.time_s, *self.output)]
 
 
 @pytest.mark.slow
