@@ -1,7 +1,7 @@
 """Protocols of evaluation: which windows train and which test, as one table of groups and deals.
 
-A group is what is never divided between training and test: a run, a session, a regime of driving.  A class
-that has one group only is cut into contiguous blocks, and training windows beside a test block are left out.
+A unit is what is never divided between training and test: a session where a class has several, otherwise a run; a
+regime of driving.  A class that has one unit only is divided as :mod:`terrain.classify.folds` does it.
 ``published`` deals 5 s partitions of runs at random, as the papers do, so that a test partition nearly always
 has its own run in training; it serves to compare with papers only.
 """
@@ -30,11 +30,13 @@ from features.windows import (
 from terrain.classify.folds import (
     N_FOLDS,
     Fold,
-    block_groups,
+    divided_units,
     fold_numbers,
+    has_sessions,
     numbered_folds,
     single_run_classes,
     two_classes,
+    units_of,
 )
 from terrain.classify.held_out import (
     MIN_CLASSES,
@@ -52,6 +54,8 @@ from terrain.records import Array, RunLog, Windows
 
 #: Of the papers: length of a partition, and stride of the class with the fewest.
 PARTITION_S, PUBLISHED_STRIDE_S = 5.0, 0.1
+#: So few sessions are held out one at a time, more are dealt into folds.
+MAX_SESSION_FOLDS = 12
 
 
 class Samples(NamedTuple):
@@ -59,7 +63,7 @@ class Samples(NamedTuple):
 
     windows: Windows
     dropped: Mapping[str, int]
-    group: Array  #: (n,) what is never divided: the run, or under ``published`` the partition
+    group: Array  #: (n, 2) session, or run without one, and run; under ``published`` the partition (n,)
     gap: int  #: windows beside a window that may share samples with it
     merged: tuple[tuple[str, ...], ...] = ()  #: ids of runs that hold the same measurements and were made one
     runs: Sequence[RunLog] = ()  #: that the windows were cut from; empty where they are not at hand
@@ -75,12 +79,17 @@ class Samples(NamedTuple):
         """Run (n,) of each window, as text."""
         return np.asarray(self.windows.run_id.astype(str))
 
+    @property
+    def unit(self) -> Array:
+        """Session (n,) of each window where a class has several, otherwise its run: what intervals are over."""
+        return units_of(self.terrain, self.windows.groups)
+
 
 class Protocol(NamedTuple):
     """What is held out, in words, and how."""
 
     held_out: str
-    #: (n,) what is held out together; empty of a window that neither trains nor tests
+    #: (n,) or (n, 2) what is held out together; empty of a window that neither trains nor tests
     units: Callable[[Samples], Array]
     #: from class, unit, number of folds and random numbers of the repeat, the fold (n,) that tests each window, -1
     #: for none
@@ -111,19 +120,17 @@ def deal_partitions(y: Array, partition: Array, n_folds: int, rng: np.random.Gen
 
 
 def sessions(samples: Samples) -> Array:
-    """Return the session (n,) of each window; of a class with one session, a block of its runs."""
-    windows = samples.windows
-    session = {run.run_id: run.session or run.run_id for run in _logs(samples)}
-    group = np.array([session[name] for name in windows.run_id], dtype=object)
-    for terrain in single_run_classes(samples.terrain, group.astype(str)):
-        rows = np.flatnonzero(windows.terrain == terrain)
-        runs = list(dict.fromkeys(windows.run_id[rows]))
-        part = {name: i * N_FOLDS // len(runs) + 1 for i, name in enumerate(runs)}
-        if len(runs) >= N_FOLDS:
-            group[rows] = [f"{group[row]} part {part[windows.run_id[row]]}" for row in rows]
-    if len(set(group)) == len(set(windows.run_id)):
-        raise DataError("the runs name no sessions that could be held out; 'grouped' holds out runs")
-    return group
+    """Return session and run (n, 2) of each window; ``DataError`` where no class has several sessions."""
+    if not has_sessions(samples.terrain, samples.group):
+        raise DataError(
+            "no terrain has several sessions, of which one could be held out; 'grouped' holds out runs"
+        )
+    return samples.group
+
+
+def whole_runs(samples: Samples) -> Array:
+    """Return the run (n,) of each window."""
+    return samples.run_id
 
 
 def regimes(samples: Samples) -> Array:
@@ -166,7 +173,14 @@ def _groups(samples: Samples) -> Array:
 #: By name.
 PROTOCOLS: dict[str, Protocol] = {
     "grouped": Protocol("whole runs held out", _groups, fold_numbers, 5),
-    "leave-one-run-out": Protocol("one run held out at a time", _groups, _leave_one_out),
+    "grouped-by-run": Protocol(
+        "whole runs held out",
+        whole_runs,
+        fold_numbers,
+        5,
+        "runs of one session lie on both sides of the split: what another day does is not shown",
+    ),
+    "leave-one-run-out": Protocol("one run held out at a time", whole_runs, _leave_one_out),
     "leave-sessions-out": Protocol("one session held out at a time", sessions, _leave_one_out),
     "leave-regimes-out": Protocol("speeds and directions of driving held out", regimes, fold_numbers, 5),
     "leave-terrain-out": Protocol(
@@ -195,23 +209,28 @@ def folds_of(samples: Samples, protocol: str = "grouped", repeats: int = 1, seed
     """
     scheme = PROTOCOLS[protocol]
     unit = scheme.units(samples)
-    used = np.flatnonzero(unit != "")
+    used = np.flatnonzero(unit.reshape(len(unit), -1)[:, 0] != "")
     y, unit = samples.terrain[used], unit[used]
     two_classes(y)
     n_runs = len(np.unique(samples.run_id))
     if scheme.whole_runs and scheme.deal is fold_numbers and n_runs < N_FOLDS:
         raise DataError(f"{n_runs} runs are fewer than {N_FOLDS} folds")
-    cut, alone = unit.astype(str), []
+    cut, alone, n_folds = unit, [], N_FOLDS
     if scheme.whole_runs:
-        alone = [np.flatnonzero(y == name) for name in single_run_classes(y, cut)]
-        cut = block_groups(y, unit, N_FOLDS).astype(str)
-    drawn = scheme.deal in (fold_numbers, deal_partitions)
+        alone = [np.flatnonzero(y == name) for name in single_run_classes(y, unit)]
+        cut = divided_units(y, unit, N_FOLDS)
+        n_units = len(np.unique(cut))
+        if has_sessions(y, unit):
+            n_folds = n_units if n_units <= MAX_SESSION_FOLDS else N_FOLDS
+    drawn = scheme.deal in (fold_numbers, deal_partitions) and (not scheme.whole_runs or n_folds < n_units)
     return [
         Fold(repeat, number, used[train], used[test])
         for repeat in range(repeats if drawn else 1)
         for number, (train, test) in enumerate(
             numbered_folds(
-                scheme.deal(y, cut, N_FOLDS, np.random.default_rng((seed, repeat))), alone, samples.gap
+                scheme.deal(y, cut.astype(str), n_folds, np.random.default_rng((seed, repeat))),
+                alone,
+                samples.gap,
             )
         )
     ]
@@ -280,7 +299,7 @@ def samples_of(
         group: Array = np.array(partition, dtype=object)
     else:
         cut = labelled(cut_windows(distinct, rule, layout=layout, skip_short=skip_short))
-        group, gap = cut.windows.run_id, rule.overlap
+        group, gap = cut.windows.groups, rule.overlap
     values = cut.windows.values
     if not any((each != each[:1, :, :1]).any() for each in values.values()):
         streams = " and ".join(repr(name) for name in values)
@@ -291,7 +310,5 @@ def samples_of(
 def _logs(samples: Samples) -> Sequence[RunLog]:
     """Return the runs of samples; windows from a cache, or cut by a user, do not have them."""
     if not samples.runs:
-        raise DataError(
-            "sessions and regimes are those of run logs, which are not at hand beside the windows"
-        )
+        raise DataError("regimes of driving are those of run logs, which are not at hand beside the windows")
     return samples.runs

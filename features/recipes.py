@@ -27,17 +27,17 @@ RECIPES = ("svm", "cnn", "stack", "best", "response")
 
 
 class WindowPipeline(Pipeline):
-    """A scikit-learn pipeline over windows that passes the run of each window to its last step.
+    """A scikit-learn pipeline over windows that passes session and run of each window to its last step.
 
-    The last step makes its inner folds of whole runs; ``cross_validate(recipe, windows, terrain,
-    groups=windows.run_id)`` therefore needs no further argument.  ``classifier__groups`` overrides the run.
+    The last step makes its inner folds of whole sessions, or runs without; ``cross_validate(recipe, windows, terrain,
+    groups=windows.run_id)`` therefore needs no further argument.  ``classifier__groups`` overrides them.
     """
 
     def fit(self, X: Windows, y: Any = None, **params: Any) -> WindowPipeline:
         """Fit all steps; the last one is given ``groups``, and which columns are samples."""
         inform(self, self[0].fit(X))
         groups = f"{self.steps[-1][0]}__groups"
-        fitted: WindowPipeline = super().fit(X, y, **{groups: X.run_id, **params})
+        fitted: WindowPipeline = super().fit(X, y, **{groups: X.groups, **params})
         return fitted
 
     def probabilities(self, windows: Windows, features: Array | None = None) -> Array:

@@ -350,13 +350,13 @@ def cut_windows(
             "is needed"
         )
 
-    def windows(values: dict[str, Array], at: Array, run_id: str, terrain: Array) -> Windows:
-        names = np.full(len(at), run_id, dtype=object)
-        return Windows(values, layout.channels, layout.rate_hz, rule.length_s, at, names, terrain)
+    def windows(values: dict[str, Array], at: Array, run_id: str, terrain: Array, session: str) -> Windows:
+        names, of = (np.full(len(at), text, dtype=object) for text in (run_id, session))
+        return Windows(values, layout.channels, layout.rate_hz, rule.length_s, at, names, terrain, of)
 
     n_samples = {name: layout.n_samples(name, rule.length_s) for name in layout.channels}
     nothing = {name: np.empty((0, len(names), n_samples[name])) for name, names in layout.channels.items()}
-    parts = [windows(nothing, np.empty(0), "", np.empty(0, dtype=object))]
+    parts = [windows(nothing, np.empty(0), "", np.empty(0, dtype=object), "")]
     dropped: Counter[str] = Counter()
     for run in runs:
         refuse_implausible(run, layout.channels)
@@ -370,7 +370,7 @@ def cut_windows(
         values, reason = cut_at(run.streams, at, rule, layout)
         dropped.update(str(why) for why in reason if why not in ("", "incomplete"))
         kept, at = {name: array[reason == ""] for name, array in values.items()}, at[reason == ""]
-        parts.append(windows(kept, at, run.run_id, label_windows(run, at, rule.length_s)))
+        parts.append(windows(kept, at, run.run_id, label_windows(run, at, rule.length_s), run.session))
     return WindowCut(join_windows(parts), dict(dropped))
 
 
@@ -382,9 +382,10 @@ def join_windows(parts: Sequence[Windows]) -> Windows:
         first.channels,
         first.rate_hz,
         first.length_s,
-        np.concatenate([part.start_s for part in parts]),
-        np.concatenate([part.run_id for part in parts]),
-        np.concatenate([part.terrain for part in parts]),
+        *(
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("start_s", "run_id", "terrain", "session")
+        ),
     )
 
 

@@ -1,11 +1,16 @@
-"""Bootstrap over runs: samples of one run are not independent, so whole runs are drawn, with replacement.
+"""Bootstrap over runs or sessions: samples of one are not independent, so whole ones are drawn, with replacement.
 
-Source: Efron and Tibshirani, An Introduction to the Bootstrap (1993), 13.3 (percentile interval).
+Sources: Efron and Tibshirani, An Introduction to the Bootstrap (1993), 13.3 (percentile interval).  Of few units a
+bootstrap within strata is too narrow twice: drawing n of n gives (n - 1) / n of the variance, which n - 1 draws of
+weight n / (n - 1) mend (Rao and Wu 1988, Resampling inference with complex survey data), and percentiles are those of
+a normal distribution, not Student's t, which percentiles further out mend (Hesterberg 2015, What teachers should know
+about the bootstrap, 4.2).
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import ndtr, stdtrit
 
 from terrain.records import Array
 
@@ -25,24 +30,31 @@ def bootstrap_counts(n: int, n_draws: int, seed: int) -> Array:
 
 
 def stratified_counts(stratum: Array, n_draws: int, rng: np.random.Generator) -> Array:
-    """Return how often each run is drawn (n_draws, runs), of each stratum as many as it has.
+    """Return the weight of each unit (n_draws, units), which add up to their number in each stratum.
 
     Parameters
     ----------
-    stratum : (runs,) that each run belongs to, as its class
+    stratum : (units,) that each run or session belongs to, as its class; the only one of a stratum counts once
     n_draws : bootstrap samples
     rng : source of the draws
 
     Examples
     --------
-    >>> stratified_counts(np.array(["ice", "ice", "mud"]), 2, np.random.default_rng(0))[:, 2]
-    array([1., 1.])
+    >>> stratified_counts(np.array(["ice", "ice", "mud"]), 2, np.random.default_rng(0)).tolist()
+    [[0.0, 2.0, 1.0], [2.0, 0.0, 1.0]]
     """
     counts = np.zeros((n_draws, len(stratum)))
     for name in np.unique(stratum):
         members = np.flatnonzero(stratum == name)
-        counts[:, members] = rng.multinomial(len(members), np.full(len(members), 1 / len(members)), n_draws)
+        n = len(members)
+        drawn = rng.multinomial(n - 1, np.full(n, 1 / n), n_draws) * n / (n - 1) if n > 1 else 1.0
+        counts[:, members] = drawn
     return counts
+
+
+def freedom_of(stratum: Array) -> int:
+    """Return the degrees of freedom of a figure over units of strata (units,): those that their means leave."""
+    return len(stratum) - len(np.unique(stratum))
 
 
 def bootstrap_rows(n: int, n_draws: int, rng: np.random.Generator) -> Array:
@@ -53,13 +65,21 @@ def bootstrap_rows(n: int, n_draws: int, rng: np.random.Generator) -> Array:
     return rng.integers(n, size=(n_draws, n))
 
 
-def percentile_interval(draws: Array, level: float = LEVEL) -> tuple[float, float]:
+def percentile_interval(draws: Array, level: float = LEVEL, freedom: float = np.inf) -> tuple[float, float]:
     """Return the interval of a given probability from bootstrap draws (n_draws,); NaN is skipped.
+
+    Percentiles are those at which Student's t of so many degrees of freedom has that probability; with none the
+    interval is NaN, with one it is about the range of the draws.
 
     Examples
     --------
     >>> percentile_interval(np.arange(101.0), 0.5)
     (25.0, 75.0)
+    >>> percentile_interval(np.arange(1001.0), 0.95, freedom=4)
+    (2.7, 997.3)
     """
-    low, high = np.nanquantile(draws, [(1 - level) / 2, (1 + level) / 2])
+    if not freedom > 0 or not np.isfinite(draws).any():
+        return np.nan, np.nan
+    below = ndtr(-stdtrit(freedom, (1 + level) / 2)) if np.isfinite(freedom) else (1 - level) / 2
+    low, high = np.nanquantile(draws, [below, 1 - below])
     return float(low), float(high)

@@ -264,19 +264,37 @@ class Windows:
     start_s: Array  #: (n_windows,) start on the clock of the run
     run_id: Array  #: (n_windows,) run of each window
     terrain: Array  #: (n_windows,) label, ``""`` where there is none
+    session: Array | None = (
+        None  #: (n_windows,) of the run of each, ``""`` where it names none; none by default
+    )
 
     def __post_init__(self) -> None:
         for name in ("values", "channels", "rate_hz"):
             object.__setattr__(self, name, dict(getattr(self, name)))
         n = len(self.start_s)
+        if self.session is None:
+            object.__setattr__(self, "session", np.full(n, "", dtype=object))
         for name, values in self.values.items():
             if values.ndim != 3 or values.shape[:2] != (n, len(self.channels[name])):
                 raise ValueError(f"stream {name}: shape {values.shape} does not fit {n} windows")
-        if len(self.run_id) != n or len(self.terrain) != n:
-            raise ValueError("start_s, run_id and terrain must have one entry a window")
+        if not len(self.run_id) == len(self.terrain) == len(self.session) == n:  # type: ignore[arg-type]
+            raise ValueError("start_s, run_id, terrain and session must have one entry a window")
 
     def __len__(self) -> int:
         return len(self.start_s)
+
+    @property
+    def groups(self) -> Array:
+        """Return session, or run where it names none, and run (n_windows, 2) of each window, as text.
+
+        Examples
+        --------
+        >>> run = np.array(["a", "b"], dtype=object)
+        >>> Windows({}, {}, {}, 2.0, np.zeros(2), run, run, np.array(["monday", ""], dtype=object)).groups.tolist()
+        [['monday', 'a'], ['b', 'b']]
+        """
+        session, run = np.asarray(self.session, dtype=str), self.run_id.astype(str)
+        return np.stack([np.where(session == "", run, session), run], axis=1)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -311,7 +329,7 @@ class Windows:
         if isinstance(index, int | np.integer):
             index = [int(index)]
         values = {name: values[index] for name, values in self.values.items()}
-        of_each = {name: getattr(self, name)[index] for name in ("start_s", "run_id", "terrain")}
+        of_each = {name: getattr(self, name)[index] for name in ("start_s", "run_id", "terrain", "session")}
         return replace(self, values=values, **of_each)
 
 

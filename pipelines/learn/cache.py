@@ -37,7 +37,7 @@ from terrain.logs.duplicates import RunPrint, possible_pairs, run_print, sentenc
 from terrain.logs.run_folders import data_digest, joint_digest
 from terrain.records import Array, RunLog, Stream, Windows
 
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 
 
 class RunHead(NamedTuple):
@@ -52,6 +52,7 @@ class RunHead(NamedTuple):
     repaired: Mapping[str, int] = {}  #: what a repairing reader dropped, as counts by kind
     print_digest: str = ""  #: of its samples, see :class:`~terrain.logs.duplicates.RunPrint`
     fault: str = ""  #: why it was skipped; empty of one that was read
+    session: str = ""
 
     def sketch(self) -> RunLog:
         """Return a run of two samples a stream that has these channels and rates, and nothing else."""
@@ -179,6 +180,7 @@ def _head(place: Path, load: RunLoader) -> tuple[RunHead, Array, Array]:
         tuple((name, stream.channels, _period_s(stream.time_s)) for name, stream in run.streams.items()),
         dict(run.dropped),
         prints.digest.hex(),
+        session=run.session,
     )
     if file is not None:
         _write(file, head._asdict(), code=prints.codes, time_s=prints.time_s)
@@ -221,15 +223,18 @@ def _table(
             raise LogError(f"{file}: was changed while it was used")
         about, columns = found
         dropped.update(about["dropped"])
-        parts.append({**columns, "run_id": np.full(len(columns["terrain"]), head.run_id, dtype=object)})
+        names = {"run_id": head.run_id, "session": head.session}
+        n = len(columns["terrain"])
+        parts.append({**columns, **{key: np.full(n, text, dtype=object) for key, text in names.items()}})
     table = {name: np.concatenate([part.pop(name) for part in parts]) for name in list(parts[0])}
-    windows = Windows({}, {}, {}, rule.length_s, table["start_s"], table["run_id"], table["terrain"])
+    of_windows = (table[name] for name in ("start_s", "run_id", "terrain", "session"))
+    windows = Windows({}, {}, {}, rule.length_s, *of_windows)
     cut, known = labelled(WindowCut(windows, dropped)), table["terrain"] != ""
     features = table["features"][known]
     if np.array_equal(features, np.broadcast_to(features[:1], features.shape), equal_nan=True):
         raise DataError("no feature ever varies: nothing can be learned from them")
     repaired = dict(sum((Counter(head.repaired) for head in heads), Counter()))
-    samples = Samples(cut.windows, dict(cut.dropped), cut.windows.run_id, rule.overlap, repaired=repaired)
+    samples = Samples(cut.windows, dict(cut.dropped), cut.windows.groups, rule.overlap, repaired=repaired)
     return samples, features, Motion(*(table[name][known] for name in Motion._fields))
 
 

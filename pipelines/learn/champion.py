@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from pipelines.live.model import ModelInfo, TerrainModel
-from terrain.classify.metrics import MIN_RUNS, Difference, paired_accuracy, runs_by_terrain
+from terrain.classify.metrics import Difference, paired_accuracy, runs_by_terrain
 from terrain.logs.run_folders import joint_digest
 
 if TYPE_CHECKING:
@@ -105,20 +106,21 @@ def judge(
             f"new data: no run on which version {version} can be judged: it was trained on them and has no "
             "figures by run, or it needs other rates, features or the samples of runs"
         )
-    unknown = len(info.run_accuracy) - found.n_runs
+    n_runs, difference = found
+    unknown = len(info.run_accuracy) - n_runs
     verdict = (
-        f"new data: on {found.n_runs} runs{f', {unknown} more not compared' if unknown else ''}, each held out, "
-        f"accuracy {found.b:.1%} against {found.a:.1%} of version {version}"
+        f"new data: on {n_runs} runs{f', {unknown} more not compared' if unknown else ''}, each held out, "
+        f"accuracy {difference.b:.1%} against {difference.a:.1%} of version {version}"
     )
-    if found.n_runs >= MIN_RUNS:
-        low, high = (100 * end for end in found.interval)
-        verdict += f" (difference 95 % over runs: {low:+.1f} to {high:+.1f} points)"
-    better = found.b >= found.a
+    low, high = (100 * end for end in difference.interval)
+    if not math.isnan(low):
+        verdict += f" (difference {evaluated.over}: {low:+.1f} to {high:+.1f} points)"
+    better = difference.b >= difference.a
     return better, f"{verdict}{remark if better else ''}"
 
 
-def compare(model: TerrainModel, info: ModelInfo, data: TrainingData) -> Difference | None:
-    """Return the accuracy of a model, and that of another while each run was held out, on the same runs.
+def compare(model: TerrainModel, info: ModelInfo, data: TrainingData) -> tuple[int, Difference] | None:
+    """Return on how many runs both were judged, and the accuracy of a model and of another, each run held out.
 
     A run that the model was not trained on is predicted, where it can be; one that it was trained on counts
     with the accuracy that it had when it was held out, where that is known.  None where there is no such run.
@@ -142,6 +144,7 @@ def compare(model: TerrainModel, info: ModelInfo, data: TrainingData) -> Differe
     names = sorted(theirs)
     own = np.array([info.run_accuracy[held_out[name]] for name in names])
     other = np.array([theirs[name] for name in names])
-    first = np.array([terrain[run_id == name][0] for name in names])
+    first = np.array([np.flatnonzero(run_id == name)[0] for name in names])
     n_windows = np.array([(run_id == name).sum() for name in names])
-    return paired_accuracy(first, n_windows, other, own, np.random.default_rng(info.seed))
+    of_runs = data.samples.unit[first], terrain[first], n_windows, other, own
+    return len(names), paired_accuracy(*of_runs, np.random.default_rng(info.seed))

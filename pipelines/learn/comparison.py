@@ -11,7 +11,6 @@ from pipelines.learn.evaluation import (
     MAX_ROWS,
     PERCENT,
     CrossvalResult,
-    held_out_words,
     notes,
     recall_figure,
     recall_table,
@@ -88,7 +87,7 @@ def side_by_side(
     if motion is not None and settings.protocol != "published":
         true_runs = held_out_support(held_out, samples.run_id, motion)[0]
         levels = support_levels(np.median(true_runs, axis=0))[held_out.tested]
-    outcomes = [Outcome.of(each, samples.run_id) for _, each in found]
+    outcomes = [Outcome.of(each, samples.unit) for _, each in found]
     differences = compare_with_first([name for name, *_ in contenders], outcomes, settings.seed, levels)
     return ComparisonResult("recipes", tuple(result for result, _ in found), differences, (), ())
 
@@ -131,7 +130,7 @@ def compare_models(
         windows = cut.windows[np.isin(cut.windows.terrain.astype(str), shared)]
         if not len(windows):
             raise DataError(f"no window of these runs is labelled as a class of all models ({classes})")
-        samples = Samples(windows, cut.dropped, windows.run_id, rule.overlap)
+        samples = Samples(windows, cut.dropped, windows.groups, rule.overlap)
         probability = np.asarray(model.recipe.predict_proba(windows))
         held_out = HeldOut.of_model(
             np.asarray(model.recipe.classes_, dtype=str), probability, samples.terrain
@@ -148,7 +147,7 @@ def compare_models(
             n_features=0,
         )
         results.append(result)
-        outcomes.append(Outcome.of(held_out, samples.run_id))
+        outcomes.append(Outcome.of(held_out, samples.unit))
     if len(results) == 1:
         left_out = f"{plural(len(excluded), 'run')} left out: the model was trained on them"
         return replace(results[0], notes=(*results[0].notes, *([left_out] if excluded else [])))
@@ -186,11 +185,12 @@ def report(result: ComparisonResult) -> Report:
         answer=(
             f"{best.b} classifies {format_value(found.b, PERCENT)} of windows correctly, {best.a} "
             f"{format_value(found.a, PERCENT)}: {format_value(apart, POINTS)} points "
-            f"({format_value(ends, POINTS)}, 95 % over runs, paired), {verdict}."
+            f"({format_value(ends, POINTS)}, {first.over}, paired), {verdict}, "
+            f"{first.held_out}."
         ),
         lead=(
             f"{what}: {plural(first.n_windows, 'window')} of {plural(first.n_runs, 'run')}, "
-            f"{held_out_words(first.protocol)}, {plural(first.repeats, 'fold assignment')}"
+            f"{plural(first.repeats, 'fold assignment')}"
         ),
         picture=recall_figure(result.contenders),
         parts=[
@@ -205,7 +205,7 @@ def report(result: ComparisonResult) -> Report:
 
 
 DIFFERENCE = Column("difference", POINTS, "points")
-INTERVAL = Column("95 % over runs, paired", POINTS, "points")
+INTERVAL = Column("95 %, paired", POINTS, "points")
 
 
 def _points(found: Difference) -> tuple[float, tuple[float, float], str]:
@@ -223,9 +223,13 @@ def _paired(found: Comparison) -> list[Part]:
         **{f"accuracy, {level}": row for level, row in found.by_support.items()},
     }
     both = Column(found.a, PERCENT), Column(found.b, PERCENT)
-    rows = [(name, row.a, row.b, *_points(row), row.n_runs) for name, row in figures.items()]
-    runs = sorted((row for row in found.by_run if row.a != row.b), key=lambda row: -abs(row.b - row.a))
+    rows = [(name, row.a, row.b, *_points(row), row.n_units) for name, row in figures.items()]
+    runs = sorted((row for row in found.by_unit if row.a != row.b), key=lambda row: -abs(row.b - row.a))
     return [
-        Table(("figure", *both, DIFFERENCE, INTERVAL, f"{found.b} is", "runs"), rows),
-        Table(("run", "terrain", *both), [tuple(row) for row in runs[:MAX_ROWS]], "Runs that differ most"),
+        Table(("figure", *both, DIFFERENCE, INTERVAL, f"{found.b} is", "units"), rows),
+        Table(
+            ("run or session", "terrain", *both),
+            [tuple(row) for row in runs[:MAX_ROWS]],
+            "Those that differ most",
+        ),
     ]

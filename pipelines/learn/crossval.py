@@ -138,7 +138,7 @@ def cross_validate(
     if not len(known):
         raise DataError("no window has a terrain label: nothing can be trained or tested")
     gap = overlap_of(known)
-    samples, contenders = Samples(known, {}, known.run_id, gap), []
+    samples, contenders = Samples(known, {}, known.groups, gap), []
     for each in recipes:
         kind = each
         if hasattr(each, "unfitted"):

@@ -23,7 +23,7 @@ from pipelines.report.numbers import format_counts
 from pipelines.report.results import Progress, silent
 from terrain.classify.changes import breakaways
 from terrain.classify.coverage import coverage_of
-from terrain.classify.folds import N_FOLDS, Fold, single_run_classes
+from terrain.classify.folds import N_FOLDS, Fold, has_sessions, run_of, single_run_classes
 from terrain.classify.held_out import (
     Applicability,
     Examples,
@@ -143,17 +143,17 @@ def evaluate_recipe(
         notes.append(NO_EXTRAS)
     if protocol == "leave-terrain-out":
         _, checked = _of_svm(recipe, features, samples, settings)
-        terrain, run_id, gap = samples.terrain, samples.group.astype(str), samples.gap
-        left_out = left_out_folds(terrain, run_id, N_FOLDS, gap, seed)
-        shared = checked, terrain, run_id, gap, seed
+        terrain, group, gap = samples.terrain, samples.group, samples.gap
+        left_out = left_out_folds(terrain, group, N_FOLDS, gap, seed)
+        shared = checked, terrain, group, gap, seed
         scores = [*parallel(score_fold, shared, left_out, settings.jobs, protocol, progress)]
-        found |= unknown_figures(scores, terrain, run_id, windows.start_s, seed)
+        found |= unknown_figures(scores, terrain, group, windows.start_s, seed)
     if not published:
-        found["conformal"] = set_figures(held_out, windows, seed)
+        found["conformal"] = set_figures(held_out, windows, samples.unit, seed)
         if motion is None:
             notes.append(f"support: {NO_MOTION}")
         else:
-            found |= coverage_of(held_out, samples.run_id, motion, windows.length_s, seed)
+            found |= coverage_of(held_out, windows.groups, motion, windows.length_s, seed)
     result = evaluation_of(
         held_out,
         samples,
@@ -171,8 +171,11 @@ def evaluate_recipe(
 
 def evaluation_of(held_out: HeldOut, samples: Samples, seed: int, **fields: Any) -> CrossvalResult:
     """Return the result of an evaluation; ``fields`` are those that held-out windows do not give."""
+    segment = run_of(samples.group)
     result = CrossvalResult(
-        **held_out_figures(held_out, samples.windows, samples.group, seed),
+        **held_out_figures(held_out, samples.windows, samples.unit, segment, seed),
+        unit="session" if has_sessions(samples.terrain, samples.windows.groups) else "run",
+        n_sessions=len(set(map(str, np.unique(samples.windows.groups[:, 0]))) - set(samples.run_id)),
         window_s=samples.windows.length_s,
         seed=seed,
         dropped=dict(samples.dropped),
@@ -221,7 +224,7 @@ def _extras(
         slow, fast = np.flatnonzero(side == "slow"), np.flatnonzero(side == "fast")
         both = accuracies(features, [Fold(0, 0, slow, fast), Fold(1, 0, fast, slow)], "slow to fast")
         slow_fast = slow_fast._replace(slow_to_fast=both[0], fast_to_slow=both[1])
-    drawn, runs_per_class = drawn_folds(terrain, samples.group.astype(str), first, seed)
+    drawn, runs_per_class = drawn_folds(terrain, samples.group, first, seed)
     curve = accuracies(features, drawn, "learning curve") if drawn else []
     tracks = [track for result in held_out.results for track in result.found or ()]
     spliced = sequence_figures([track for track in tracks if track.spliced], seed)
@@ -254,6 +257,14 @@ def _notes(
         yield (
             f"{', '.join(alone)}: one run only, cut into {N_FOLDS} contiguous blocks with a gap; "
             "its figures are optimistic, the same run trains and tests"
+        )
+    once = single_run_classes(samples.terrain, samples.windows.groups[:, 0])
+    if has_sessions(samples.terrain, samples.windows.groups) and (
+        once := [each for each in once if each not in alone]
+    ):
+        yield (
+            f"{', '.join(once)}: one session only, whose runs are divided into {N_FOLDS} parts: what another day does "
+            "is not shown"
         )
     if PROTOCOLS[protocol].note:
         yield PROTOCOLS[protocol].note

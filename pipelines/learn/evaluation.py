@@ -42,13 +42,15 @@ optional = partial(described, optional=True)
 class CrossvalResult(Result):
     """An evaluation on held-out windows: its figures, how they were obtained, and what to know of them.
 
-    Figures are means over the repeats, intervals of 95 % over runs within classes.  ``data``, where the data
-    lie for the next step, is not in JSON.
+    Figures are means over the repeats, intervals of 95 % over units, runs or sessions, within classes.  ``data``,
+    where the data lie for the next step, is not in JSON.
     """
 
     classes: tuple[str, ...] = described("terrains")
     n_windows: int = described("windows that were held out")
     n_runs: int = described("runs that they are of")
+    n_sessions: int = described("sessions that the runs name")
+    unit: str = described("what intervals are over, and what is held out whole: session or run")
     repeats: int = described("fold assignments")
     accuracy: float = described("windows classified correctly", "1")
     accuracy_spread: float | None = described("standard deviation over the repeats", "1")
@@ -122,19 +124,32 @@ class CrossvalResult(Result):
         return max(counts) / sum(counts)
 
     @property
+    def over(self) -> str:
+        """What intervals are over, in words."""
+        return "95 % over sessions, Student's t" if self.unit == "session" else "95 % over runs"
+
+    @property
+    def held_out(self) -> str:
+        """What was held out, in words, and what that does not show."""
+        if self.unit == "session":
+            return held_out_words(self.protocol).replace("whole runs", "whole sessions")
+        within = "runs that name no session" if not self.n_sessions else "one session"
+        return f"{held_out_words(self.protocol)}, within {within}: what another day does is not shown"
+
+    @property
     def weaknesses(self) -> tuple[str, ...]:
         """Why the accuracy must not be relied on, in sentences; none where it may."""
         low, high = self.accuracy_ci
         found = []
         if not low > self.chance:
             found.append(
-                f"the accuracy (95 % over runs: {format_value((low, high), PERCENT)}) is not above chance, "
+                f"the accuracy ({self.over}: {format_value((low, high), PERCENT)}) is not above chance, "
                 f"{format_value(self.chance, PERCENT)} (always the most frequent class)"
             )
         if not high - low <= WIDE_INTERVAL:
             found.append(
-                f"the interval of the accuracy is {100 * (high - low):.0f} points wide: more runs are needed to "
-                "rely on it"
+                f"the interval of the accuracy is {100 * (high - low):.0f} points wide: more {self.unit}s are needed "
+                "to rely on it"
             )
         return tuple(found)
 
@@ -163,8 +178,8 @@ def report(result: CrossvalResult) -> Report:
     return Report(
         title=f"Evaluation on held-out runs of {dataset}",
         answer=(
-            f"{format_value(result.accuracy, PERCENT)} of windows classified correctly, "
-            f"{held_out_words(result.protocol)} ({format_value(result.accuracy_ci, PERCENT)}, 95 % over runs)."
+            f"{format_value(result.accuracy, PERCENT)} of windows classified correctly "
+            f"({format_value(result.accuracy_ci, PERCENT)}, {result.over}), {result.held_out}."
         ),
         lead=(
             f"{dataset}, recipe {result.recipe}: {plural(result.n_windows, 'window')} of {result.window_s:g} s "
@@ -267,7 +282,7 @@ def _confidence(result: CrossvalResult) -> list[Part]:
     if sets is not None:
         rows += [
             (f"sets of terrains at {sets.level:.0%} that hold the true one", sets.coverage, PERCENT),
-            ("  95 % over runs", sets.coverage_ci, PERCENT),
+            (f"  {result.over}", sets.coverage_ci, PERCENT),
             ("  in the worst run", sets.coverage_worst_run, PERCENT),
             ("  terrains in a set", sets.set_size, ".2f"),
             ("  sets with one terrain", sets.single_ratio, PERCENT),
@@ -287,7 +302,7 @@ def _coverage(result: CrossvalResult) -> list[Part]:
     parts: list[tuple[Any, Any]] = [(each["support"], each) for each in result.accuracy_by_support or ()]
     parts += [("unsupported prediction", result.unsupported), ("other predictions", result.supported)]
     rows = [(text, *(value_at(part, name) for name in names)) for text, part in parts]
-    head = [Column(name, PERCENT) for name in ("windows", "accuracy", "95 % over runs", "of the errors")]
+    head = [Column(name, PERCENT) for name in ("windows", "accuracy", result.over, "of the errors")]
     cells = {(row.terrain, row.regime): row.accuracy for row in support}
     regimes = list(dict.fromkeys(row.regime for row in support))
     driven = [(name, *(cells.get((name, regime)) for regime in regimes)) for name in result.classes]

@@ -22,10 +22,9 @@ from pipelines.learn.evaluate import evaluate
 from pipelines.learn.parallel import parallel
 from pipelines.learn.training_data import TrainingData
 from pipelines.report.results import Progress, as_json
-from terrain.bootstrap import percentile_interval
-from terrain.classify.folds import Fold, inner_splits
+from terrain.classify.folds import Fold, inner_splits, units_of
 from terrain.classify.held_out import Examples
-from terrain.classify.metrics import Difference, Outcome, compare_outcomes, drawn_runs
+from terrain.classify.metrics import Difference, Outcome, accuracy_interval, compare_outcomes
 from terrain.classify.svm import CANDIDATES, Candidate, GroupedSVC
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write
@@ -39,7 +38,6 @@ SPACE = {"C": (0.3, 300.0), "gamma": (0.03, 3.0), "percentile": (40.0, 100.0)}
 N_INNER_FOLDS = 5
 BEST_FILE, TRIALS_FILE, STUDY_FILE = "best.json", "trials.jsonl", "search.json"
 VERSION = 1
-N_DRAWS = 1000
 
 
 class Trial(NamedTuple):
@@ -109,11 +107,11 @@ def search(
         atomic_write(folder / TRIALS_FILE, lines)
     best = max(trials[:n_trials], key=lambda trial: trial.accuracy)
     default, found = (  # on runs that no trial has seen
-        Outcome.of(evaluate(GroupedSVC(of, gap=samples.gap, seed=seed), examples, [outer]), examples.group)
+        Outcome.of(evaluate(GroupedSVC(of, gap=samples.gap, seed=seed), examples, [outer]), samples.unit)
         for of in (CANDIDATES, (best.params,))
     )
     held_out = compare_outcomes(default, found, np.random.default_rng(seed)).accuracy
-    runs = tuple(np.unique(samples.group[outer.test].astype(str)).tolist())
+    runs = tuple(np.unique(samples.run_id[outer.test]).tolist())
     result = SearchResult(len(trials), resumed, best, held_out, runs, folder / BEST_FILE)
     document = {"version": VERSION, "data_digest": data.digest, "held_out": held_out, **best._asdict()}
     atomic_write(result.params_file, json.dumps(as_json(document), indent=2) + "\n")
@@ -166,8 +164,6 @@ def _tried(examples: Examples, gap: int, seed: int, params: Candidate) -> Trial:
     held_out = evaluate(GroupedSVC((params,), gap=gap, seed=seed), examples, folds)
     known = held_out.tested
     correct = held_out.correct[0, known]
-    runs = group[known].astype(str), terrain[known]
-    weights, place = drawn_runs(*runs, N_DRAWS, np.random.default_rng(seed))
-    hits, sizes = np.bincount(place, weights=correct), np.bincount(place)
-    draws = (weights @ hits / (weights @ sizes))[1:]
-    return Trial(params, float(correct.mean()), percentile_interval(draws))
+    unit = units_of(terrain, group)[known]
+    interval = accuracy_interval(correct * 1.0, unit, terrain[known], np.random.default_rng(seed))
+    return Trial(params, float(correct.mean()), interval)

@@ -21,6 +21,7 @@ WITHOUT_SVM = ("cnn", "response")
 
 ProtocolName = Literal[
     "grouped",
+    "grouped-by-run",
     "leave-one-run-out",
     "leave-sessions-out",
     "leave-regimes-out",
@@ -30,7 +31,7 @@ ProtocolName = Literal[
     "fast-slow",
 ]
 """The names of ``features.protocols.PROTOCOLS``."""
-SEVERAL_REPEATS = ("grouped", "leave-regimes-out", "leave-terrain-out", "published")
+SEVERAL_REPEATS = ("grouped", "grouped-by-run", "leave-regimes-out", "leave-terrain-out", "published")
 
 WINDOW_S = 2.0
 PUBLISHED_WINDOW_S = 1.7

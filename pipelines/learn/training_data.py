@@ -134,18 +134,18 @@ def with_limits(
     samples, features, motion : the windows, their features (n, f), and how the robot moved in each, if known
     """
     notes, conformal, novelty, support = [], None, None, None
-    terrain, run_id = samples.terrain, samples.run_id
+    terrain = samples.terrain
     try:
-        novelty = learn_novelty(features, terrain, run_id, gap=samples.gap, seed=info.seed)
+        novelty = learn_novelty(features, terrain, samples.group, gap=samples.gap, seed=info.seed)
     except DataError as error:
         notes.append(f"no window is ever called unknown: {error}")
     try:
-        conformal = conformal_threshold(held_out_scores(recipe[-1], terrain), run_id)
+        conformal = conformal_threshold(held_out_scores(recipe[-1], terrain), samples.unit)
     except (AttributeError, DataError) as error:
         notes.append(f"no sets of terrains: {error}")
     if motion is not None:
         driven = motion.speed_mps, motion.yaw_rate_radps
-        support = learn_support(*driven, terrain, run_id, np.unique(terrain).tolist())
+        support = learn_support(*driven, terrain, samples.run_id, np.unique(terrain).tolist())
     return TerrainModel(recipe, replace(info, conformal=conformal), novelty, support), tuple(notes)
 
 
@@ -163,5 +163,5 @@ def fitted_model(
     settings = settings or RecipeSettings()
     data = data_of_runs(runs, settings)
     info = info_of(data, settings, dataset)
-    data.recipe[-1].fit(data.rows, data.samples.terrain, groups=data.samples.windows.run_id)
+    data.recipe[-1].fit(data.rows, data.samples.terrain, groups=data.samples.group)
     return TerrainModel(data.recipe, info)

@@ -13,7 +13,7 @@ al., Learning Curves: Asymptotic Values and Rate of Convergence, 1994).
 Regimes are those that a person can ask for: a range of speed, straight on, in a curve or on the spot.  Accuracy is also
 given by support, by the true terrain and by the mark that needs no label.  Each held-out window is judged by a table of
 the training windows of its own fold.  Figures are ratios of sums over windows, their intervals those of a bootstrap
-that draws whole runs within their classes.
+that draws whole units (sessions where there are, otherwise runs) within their classes.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
+from terrain.classify.folds import run_of, units_of
 from terrain.classify.held_out import HeldOut
 from terrain.classify.limits import (
     SUPPORTED,
@@ -34,7 +35,7 @@ from terrain.classify.limits import (
     support_levels,
     supported_probability,
 )
-from terrain.classify.metrics import N_BOOTSTRAP, Interval, confidence_auc, drawn_runs, ratio_over_runs
+from terrain.classify.metrics import N_BOOTSTRAP, Draws, Interval, confidence_auc
 from terrain.records import Array
 
 #: At most so many ranges of speed, none narrower: closer speeds are not worth asking an operator for.
@@ -235,7 +236,7 @@ class NextDrive(NamedTuple):
 
 
 def coverage_of(
-    held_out: HeldOut, run_id: Array, motion: Motion, window_s: float, seed: int
+    held_out: HeldOut, groups: Array, motion: Motion, window_s: float, seed: int
 ) -> Mapping[str, Any]:
     """Return the coverage of held-out windows, by name.
 
@@ -252,6 +253,7 @@ def coverage_of(
     unsupported, supported : by the mark of the prediction, without a label
     supported_auc : area from the supported probability to correctness, None where all are right
     """
+    unit, run_id = units_of(held_out.truth, groups), run_of(groups)
     classes, tested = [str(name) for name in held_out.classes], np.flatnonzero(held_out.tested)
     table = learn_support(motion.speed_mps, motion.yaw_rate_radps, held_out.truth, run_id, classes)
     true_runs, probability = (each[:, tested] for each in held_out_support(held_out, run_id, motion))
@@ -286,18 +288,18 @@ def coverage_of(
             asked = name, driven, ADDED_RUNS, lasts_s, float(gain[i])
             drives.append(NextDrive(*asked, cells[i][-1], n, right))
 
-    weights, place_of = drawn_runs(run_id, terrain, N_BOOTSTRAP, np.random.default_rng(seed))
+    draws = Draws.of(unit[tested], terrain, N_BOOTSTRAP, np.random.default_rng(seed))
 
     def total(windows: Array) -> Array:
-        return np.asarray(weights @ np.bincount(place_of, windows.sum(axis=0), weights.shape[1]))
+        return np.asarray(draws.weights @ np.bincount(draws.place, windows.sum(axis=0)))
 
     def part(inside: Array) -> PartFigures:
         n_all, n_inside, n_wrong, n_wrong_inside = map(
             total, (np.ones(correct.shape), inside, ~correct, inside & ~correct)
         )
-        ratio, interval = ratio_over_runs(n_inside, n_all)
-        accuracy = ratio_over_runs(n_inside - n_wrong_inside, n_inside)
-        of_errors = ratio_over_runs(n_wrong_inside, n_wrong)
+        ratio, interval = draws.ratio(n_inside, n_all)
+        accuracy = draws.ratio(n_inside - n_wrong_inside, n_inside)
+        of_errors = draws.ratio(n_wrong_inside, n_wrong)
         return PartFigures(ratio or 0.0, interval or (0.0, 0.0), *accuracy, *of_errors)
 
     level, supported = support_levels(true_runs), probability >= SUPPORTED

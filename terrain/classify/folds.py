@@ -1,10 +1,14 @@
-"""Folds that keep runs whole: one implementation for the outer evaluation and the inner choices.
+"""Folds that keep sessions and runs whole: one implementation for the outer evaluation and the inner choices.
 
-Runs are dealt at random, class by class, each to the fold that so far holds the fewest runs of that class
+What another day does is shown by a session that was held out whole: where runs name sessions, and a class has several,
+the session is the unit; without, the run is.  ``groups`` is (n,) the run of each row, or (n, 2) its session and run.
+
+Units are dealt at random, class by class, each to the fold that so far holds the fewest units of that class
 and, among those, the fewest windows.  (scikit-learn's ``StratifiedGroupKFold`` sorts groups by size before
 dealing; with runs of unequal length nearly every seed gives the same folds, and a spread over seeds is
-meaningless.)  A class that has a single run cannot be both held out whole and trained on: its run is
-cut into contiguous blocks, and training windows beside a test block are left out.
+meaningless.)  A class that has a single unit cannot be both held out whole and trained on: its session is divided
+into parts of whole runs that follow each other; its only run into contiguous blocks, and training windows beside a test
+block are left out.
 """
 
 from __future__ import annotations
@@ -41,26 +45,59 @@ def two_classes(y: Array) -> Array:
     return classes
 
 
+def run_of(groups: Array) -> Array:
+    """Return the run (n,) of each row, as text."""
+    return np.asarray(groups, dtype=str).reshape(len(groups), -1)[:, -1]
+
+
 def single_run_classes(y: Array, groups: Array) -> list[Any]:
-    """Return the classes that have one run only."""
-    return [c for c in np.unique(y).tolist() if len(np.unique(groups[y == c])) == 1]
+    """Return the classes that have one run only, or, of a column of sessions, one session."""
+    run = run_of(groups)
+    return [c for c in np.unique(y).tolist() if len(np.unique(run[y == c])) == 1]
 
 
-def block_groups(y: Array, groups: Array, n_blocks: int) -> Array:
-    """Return groups in which the run of each single-run class is cut into contiguous blocks by row order."""
-    cut = np.asarray(groups, dtype=object).copy()
-    for terrain in single_run_classes(y, groups):
+def has_sessions(y: Array, groups: Array) -> bool:
+    """Return whether a class has several sessions, of which one can be held out whole."""
+    session, run = np.asarray(groups, dtype=str).reshape(len(groups), -1)[:, [0, -1]].T
+    return not np.array_equal(session, run) and len(single_run_classes(y, session)) < len(np.unique(y))
+
+
+def units_of(y: Array, groups: Array) -> Array:
+    """Return the session (n,) of each row, as text, where a class has several; otherwise the run."""
+    return np.asarray(groups, dtype=str).reshape(len(groups), -1)[:, 0 if has_sessions(y, groups) else -1]
+
+
+def divided_units(y: Array, groups: Array, n_parts: int) -> Array:
+    """Return the unit (n,) of each row, those of classes that have one only in so many parts that follow each other.
+
+    Examples
+    --------
+    >>> groups = np.array([["monday", "a"], ["monday", "b"], ["tuesday", "c"], ["tuesday", "d"]])
+    >>> divided_units(np.array(["ice"] * 4), groups, 2).tolist()
+    ['monday', 'monday', 'tuesday', 'tuesday']
+    >>> divided_units(np.array(["ice", "mud", "ice", "ice"]), groups, 2).tolist()
+    ['monday', 'monday block 1', 'tuesday', 'tuesday']
+    """
+    unit, run = units_of(y, groups), run_of(groups)
+    divided = unit.astype(object)
+    for terrain in single_run_classes(y, unit):
         rows = np.flatnonzero(y == terrain)
-        for number, block in enumerate(np.array_split(rows, n_blocks)):
-            cut[block] = f"{groups[rows[0]]} block {number + 1}"
-    return cut
+        runs, place = np.unique(run[rows], return_inverse=True)
+        if len(runs) > 1:
+            divided[rows] = [
+                f"{unit[rows[0]]} part {i * min(n_parts, len(runs)) // len(runs) + 1}" for i in place
+            ]
+            continue
+        for number, block in enumerate(np.array_split(rows, n_parts)):
+            divided[block] = f"{runs[0]} block {number + 1}"
+    return divided.astype(str)
 
 
 def fold_numbers(y: Array, groups: Array, n_folds: int, rng: np.random.Generator) -> Array:
-    """Return the fold (n,) that tests each window: whole groups are dealt at random, evenly within each class.
+    """Return the fold (n,) that tests each window: whole units (n,) are dealt at random, evenly within each class.
 
-    A group with several classes counts for its most frequent one.  ``DataError`` where there is one class only,
-    or there are fewer groups than folds.
+    A unit with several classes counts for its most frequent one.  ``DataError`` where there is one class only,
+    or there are fewer units than folds.
     """
     two_classes(y)
     names, group_of = np.unique(np.asarray(groups, dtype=str), return_inverse=True)
@@ -85,7 +122,7 @@ def fold_numbers(y: Array, groups: Array, n_folds: int, rng: np.random.Generator
 def split_runs(
     y: Array, groups: Array, n_folds: int, rng: np.random.Generator, gap: int = 1
 ) -> Iterator[tuple[Array, Array]]:
-    """Yield training and test rows of folds that keep runs whole; errors as :func:`fold_numbers`.
+    """Yield training and test rows of folds that keep sessions or runs whole; errors as :func:`fold_numbers`.
 
     ``gap`` training windows are left out on each side of a test block, where a single run had to be cut; windows
     of a run are in order of time.
@@ -99,7 +136,7 @@ def split_runs(
     [2 3 8 9] [0 1 4 5 6]
     [0 1 4 5] [2 3 7 8 9]
     """
-    number = fold_numbers(y, block_groups(y, groups, n_folds), n_folds, rng)
+    number = fold_numbers(y, divided_units(y, groups, n_folds), n_folds, rng)
     return numbered_folds(number, [np.flatnonzero(y == name) for name in single_run_classes(y, groups)], gap)
 
 
@@ -123,13 +160,13 @@ def numbered_folds(
 def inner_splits(
     y: Array, groups: Array, n_folds: int, seed: int, gap: int = 1, *, lacking: bool = False
 ) -> Iterator[tuple[Array, Array]]:
-    """Yield training and test rows of inner folds of whole runs, fewer folds where there are fewer runs.
+    """Yield training and test rows of inner folds of whole sessions or runs, fewer folds where there are fewer.
 
     A gap may leave out all rows of a class: such a fold is skipped, with ``lacking`` only where one class is left.
     ``DataError`` where the rows are too few to hold some of them out.
     """
     classes, n_rows = np.unique(y, return_counts=True)
-    n_groups = len(np.unique(block_groups(y, groups, n_folds).astype(str)))
+    n_groups = len(np.unique(divided_units(y, groups, n_folds)))
     n_folds = min(n_folds, n_groups, *n_rows)
     if n_folds < 2:
         raise DataError(TOO_FEW)

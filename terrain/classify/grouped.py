@@ -26,10 +26,10 @@ N_INNER_FOLDS = 3
 class GroupedClassifier(ClassifierMixin, BaseEstimator):
     """A classifier that keeps runs whole; missing values are NaN.
 
-    Subclasses have ``fit(X, y, groups)``, where X is (n, f), y (n,) classes and ``groups`` (n,) the run of each row,
-    each row its own when missing, and ``predict_proba``; fitted ones have ``classes_`` (k,) and, for thresholds and
-    calibration, ``inner_probability_`` (n, k) of the training rows when their run was held out, NaN where it never
-    was.  All raise ``DataError`` where there is one class only.
+    Subclasses have ``fit(X, y, groups)``, where X is (n, f), y (n,) classes and ``groups`` the run (n,), or session and
+    run (n, 2), of each row, each row its own when missing, and ``predict_proba``; fitted ones have ``classes_`` (k,)
+    and, for thresholds and calibration, ``inner_probability_`` (n, k) of the training rows when their session or run
+    was held out, NaN where it never was.  All raise ``DataError`` where there is one class only.
     """
 
     def _training_rows(self, X: Array, y: Array, groups: Array | None) -> tuple[Array, Array, Array]:

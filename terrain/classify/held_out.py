@@ -16,14 +16,14 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from sklearn.base import clone
 
-from terrain.classify.folds import Fold, block_groups, split_runs
+from terrain.classify.folds import Fold, divided_units, run_of, split_runs, units_of
 from terrain.classify.limits import conformal_threshold, held_out_scores, learn_novelty
 from terrain.errors import DataError
 from terrain.records import Array
 
 
 class Examples(NamedTuple):
-    """What a classifier learns from: features (n, f), class and run (n,); a run must not be split."""
+    """What a classifier learns from: features (n, f), class (n,), and run (n,) or session and run (n, 2)."""
 
     features: Array
     terrain: Array
@@ -70,7 +70,7 @@ def fit_fold(
     if hasattr(fitted, "inner_probability_"):
         try:
             scores = held_out_scores(fitted, terrain[train])
-            threshold = conformal_threshold(scores, np.asarray(group)[train].astype(str))
+            threshold = conformal_threshold(scores, units_of(terrain[train], group[train]))
         except DataError:
             pass
     return FoldResult(fold, probability, chosen, None if ask is None else ask(fitted), threshold)
@@ -138,6 +138,7 @@ def drawn_folds(y: Array, group: Array, folds: Sequence[Fold], seed: int) -> tup
     folds : :data:`CURVE_DRAWS` repeats a size, of folds of one repeat
     runs_per_class : of each size, and of all runs
     """
+    group = run_of(group)
     available = [
         np.array([len(set(group[train][y[train] == name])) for name in np.unique(y[train])])
         for _, _, train, _ in folds
@@ -161,7 +162,7 @@ MIN_TERRAINS = 3  #: Two are needed to train without the third.
 
 
 def left_out_folds(
-    terrain: Array, run_id: Array, n_folds: int, gap: int, seed: int
+    terrain: Array, groups: Array, n_folds: int, gap: int, seed: int
 ) -> list[tuple[Array, Array, Array]]:
     """Return training rows, held-out rows and rows of the terrain that is left out, terrain by terrain.
 
@@ -176,11 +177,11 @@ def left_out_folds(
     folds = []
     for name in terrains:
         rows, unknown = np.flatnonzero(y != name), np.flatnonzero(y == name)
-        n_groups = len(np.unique(block_groups(y[rows], run_id[rows], n_folds).astype(str)))
+        n_groups = len(np.unique(divided_units(y[rows], groups[rows], n_folds)))
         if n_groups < n_folds:
             raise DataError(f"{n_groups} runs without {name} are fewer than {n_folds} folds")
         rng = np.random.default_rng((seed, 0))
-        for train, test in split_runs(y[rows], run_id[rows], n_folds, rng, gap):
+        for train, test in split_runs(y[rows], groups[rows], n_folds, rng, gap):
             if len(test):
                 folds.append((rows[train], rows[test], unknown))
     return folds

@@ -1,9 +1,10 @@
 """Figures of merit of held-out windows: accuracy, votes, confidence, sets of classes, terrain over time, differences.
 
-Windows of one run are not independent: intervals are those of a bootstrap that draws whole runs, within their
-classes, and computes each figure again from the windows of the runs drawn.  Two classifiers are judged on the same
-runs, and a run that is hard for one is mostly hard for the other: taking the figures of both from the same draw
-leaves this common part out of the interval of their difference.
+Windows of one run are not independent, nor are runs of one session: intervals are those of a bootstrap that draws whole
+units (sessions where a class has several, otherwise runs) within their classes, and computes each figure again from the
+windows of the units drawn; of few units the percentiles are those of Student's t (:mod:`terrain.bootstrap`).  Two
+classifiers are judged on the same units, and one that is hard for one is mostly hard for the other: taking the figures
+of both from the same draw leaves this common part out of the interval of their difference.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
 
-from terrain.bootstrap import bootstrap_counts, bootstrap_rows, percentile_interval, stratified_counts
+from terrain.bootstrap import freedom_of, percentile_interval, stratified_counts
+from terrain.classify.folds import run_of, units_of
 from terrain.classify.held_out import CURVE_DRAWS, HeldOut, Scored
 from terrain.classify.limits import KNOWN_KEPT, LEVEL, SupportLevel, conformal_sets
 from terrain.errors import DataError
@@ -33,50 +35,45 @@ Interval = tuple[float, float]
 NO_INTERVAL: Interval = (math.nan, math.nan)
 
 
-def drawn_runs(
-    run_id: Array,
-    terrain: Array,
-    n_draws: int,
-    rng: np.random.Generator,
-    counts_of: Callable[[Array, int, np.random.Generator], Array] = stratified_counts,
-) -> tuple[Array, Array]:
-    """Return how often each run counts: once (the first row), then as it is drawn within its class; and runs (n,).
+class Draws(NamedTuple):
+    """How often each unit counts: once (the first row), then as it is drawn within its class."""
 
-    A run of several classes counts for each.  The weights are (1 + n_draws, runs).
-    """
-    names = np.char.add(np.char.add(terrain.astype(str), "\n"), run_id.astype(str))
-    _, first, place = np.unique(names, return_index=True, return_inverse=True)
-    return np.vstack([np.ones(len(first)), counts_of(terrain[first], n_draws, rng)]), place
+    weights: Array  #: (1 + draws, units)
+    place: Array  #: (n,) unit of each window
+    freedom: int  #: of a figure over the units
 
+    @classmethod
+    def of(cls, unit: Array, terrain: Array, n_draws: int, rng: np.random.Generator) -> Self:
+        """Return draws of the units (n,) of windows within their classes (n,); one of several counts for each."""
+        names = np.char.add(np.char.add(terrain.astype(str), "\n"), unit.astype(str))
+        _, first, place = np.unique(names, return_index=True, return_inverse=True)
+        stratum = terrain[first]
+        weights = np.vstack([np.ones(len(first)), stratified_counts(stratum, n_draws, rng)])
+        return cls(weights, place, freedom_of(stratum))
 
-def row_counts(stratum: Array, n_draws: int, rng: np.random.Generator) -> Array:
-    """Return what :func:`~terrain.bootstrap.stratified_counts` does, one run drawn after the other."""
-    counts = np.zeros((n_draws, len(stratum)))
-    for name in np.unique(stratum):
-        members = np.flatnonzero(stratum == name)
-        drawn = members[bootstrap_rows(len(members), n_draws, rng)]
-        np.add.at(counts, (np.arange(n_draws)[:, None], drawn), 1.0)
-    return counts
+    def interval(self, figures: Array) -> Interval:
+        """Return the 95 % interval of a figure of each draw (draws,) without the first; NaN where there is none."""
+        return percentile_interval(figures, freedom=self.freedom)
 
-
-def ratio_over_runs(numerator: Array, denominator: Array) -> tuple[float | None, Interval | None]:
-    """Return the first ratio, and the interval of the others; None where the first has no denominator."""
-    if not denominator[0]:
-        return None, None
-    ratio: Array = np.full(len(numerator), np.nan)
-    np.divide(numerator, denominator, out=ratio, where=denominator > 0)
-    return float(ratio[0]), percentile_interval(ratio[1:]) if np.isfinite(ratio[1:]).any() else None
+    def ratio(self, numerator: Array, denominator: Array) -> tuple[float | None, Interval | None]:
+        """Return the first ratio, and the interval of the others; None where the first has no denominator."""
+        if not denominator[0]:
+            return None, None
+        ratio: Array = np.full(len(numerator), np.nan)
+        np.divide(numerator, denominator, out=ratio, where=denominator > 0)
+        low, high = self.interval(ratio[1:])
+        return float(ratio[0]), None if math.isnan(low) else (low, high)
 
 
-def run_bootstrap(correct: Array, run_id: Array, terrain: Array, rng: np.random.Generator) -> Interval:
-    """Return a 95 % interval of the accuracy by resampling whole runs within their classes.
+def accuracy_interval(correct: Array, unit: Array, terrain: Array, rng: np.random.Generator) -> Interval:
+    """Return a 95 % interval of the accuracy by resampling whole units (n,) within their classes.
 
     ``correct`` (n,) is the fraction of the repeats in which each window was classified correctly.  A class with one
-    run adds no spread, and with three or four a class the interval is still too narrow.
+    unit adds no spread; where all have one, the interval is NaN.
     """
-    weights, place = drawn_runs(run_id, terrain, N_BOOTSTRAP, rng, row_counts)
-    hits, sizes = np.bincount(place, weights=correct), np.bincount(place)
-    return percentile_interval((weights[1:] @ hits) / (weights[1:] @ sizes))
+    draws = Draws.of(unit, terrain, N_BOOTSTRAP, rng)
+    hits, sizes = np.bincount(draws.place, weights=correct), np.bincount(draws.place)
+    return draws.interval((draws.weights[1:] @ hits) / (draws.weights[1:] @ sizes))
 
 
 class ClassFigures(NamedTuple):
@@ -239,15 +236,15 @@ def calibration_error(confidence: Array, correct: Array, weights: Array, n_bins:
 
 
 def confidence_figures(
-    confidence: Array, correct: Array, run_id: Array, terrain: Array, rng: np.random.Generator
+    confidence: Array, correct: Array, unit: Array, terrain: Array, rng: np.random.Generator
 ) -> dict[str, Any]:
     """Return how the confidence of held-out windows (repeats, n) relates to their correctness, by name.
 
     The area is the probability that a window that is right has a higher confidence than one that is wrong, ``ece`` the
     expected calibration error of the top label.  Figures are means over the repeats, bins hold all repeats.
     """
-    of_runs, place = drawn_runs(run_id, terrain, N_DRAWS, rng)
-    weights = of_runs[:, place]
+    of_units = Draws.of(unit, terrain, N_DRAWS, rng)
+    weights = of_units.weights[:, of_units.place]
     at_once = max(1, DRAWS_AT_ONCE_VALUES // weights.shape[1])
 
     def figure(of: Callable[[Array, Array, Array], Array]) -> tuple[float, Interval]:
@@ -255,8 +252,7 @@ def confidence_figures(
         for c, right in zip(confidence, correct.astype(float), strict=True):
             blocks = [of(c, right, weights[i : i + at_once]) for i in range(0, len(weights), at_once)]
             draws += np.concatenate(blocks) / len(confidence)
-        known = np.isfinite(draws[1:]).any()
-        return float(draws[0]), percentile_interval(draws[1:]) if known else NO_INTERVAL
+        return float(draws[0]), of_units.interval(draws[1:])
 
     at_coverage, n = [], confidence.shape[1]
     for coverage in COVERAGES:
@@ -266,7 +262,7 @@ def confidence_figures(
     stated, right, bins = confidence.ravel(), correct.ravel().astype(float), []
     for rows in np.array_split(np.argsort(stated, kind="stable"), min(CALIBRATION_BINS, len(stated))):
         drawn = weights[:, rows % n]
-        accuracy, interval = ratio_over_runs(drawn @ right[rows], drawn.sum(axis=1))
+        accuracy, interval = of_units.ratio(drawn @ right[rows], drawn.sum(axis=1))
         of_bin = float(stated[rows].mean()), accuracy or 0.0, len(rows), interval or NO_INTERVAL
         bins.append(ReliabilityBin(*of_bin))
     auc, auc_ci = figure(confidence_auc)
@@ -281,11 +277,13 @@ def confidence_figures(
     }
 
 
-def held_out_figures(held_out: HeldOut, windows: Windows, group: Array, seed: int) -> dict[str, Any]:
+def held_out_figures(
+    held_out: HeldOut, windows: Windows, unit: Array, segment: Array, seed: int
+) -> dict[str, Any]:
     """Return the figures of merit of held-out windows, by name.
 
-    Figures are means over the repeats, intervals of 95 % over runs within classes; ``per_class`` and
-    ``confusion`` are of all repeats together.  Votes are taken among the windows of a group (n,), as far as one fold
+    Figures are means over the repeats, intervals of 95 % over units (n,) within classes; ``per_class`` and
+    ``confusion`` are of all repeats together.  Votes are taken among the windows of a segment (n,), as far as one fold
     tested them.
     """
     rows, classes = np.flatnonzero(held_out.tested), held_out.classes
@@ -294,10 +292,10 @@ def held_out_figures(held_out: HeldOut, windows: Windows, group: Array, seed: in
     probability, fold_number = held_out.probability[:, rows], held_out.fold_number[:, rows]
     predicted = classes[probability.argmax(axis=2)]
     correct = predicted == terrain
-    group_of = np.unique(group.astype(str)[rows], return_inverse=True)[1]
-    segments, votes = group_of * (fold_number.max() + 1) + fold_number, []
-    for p, segment in zip(probability, segments, strict=True):
-        votes.append(vote(p, segment, start_s, windows.length_s))
+    segment_of = np.unique(segment.astype(str)[rows], return_inverse=True)[1]
+    segments, votes = segment_of * (fold_number.max() + 1) + fold_number, []
+    for p, each in zip(probability, segments, strict=True):
+        votes.append(vote(p, each, start_s, windows.length_s))
     voted = classes[np.stack([each for each, _ in votes])] == terrain
     repeats = [class_figures(terrain, each, classes) for each in predicted]
     pooled = class_figures(np.tile(terrain, len(predicted)), predicted.ravel(), classes)
@@ -316,7 +314,8 @@ def held_out_figures(held_out: HeldOut, windows: Windows, group: Array, seed: in
         sizes = len(fold.train), len(fold.test)
         accuracy = float(np.nanmean(right[fold.repeat, fold.test]))
         folds.append(FoldFigures(fold.repeat, fold.number, *sizes, accuracy, chosen))
-    of_confidence = probability.max(axis=2), correct, run_id, terrain, np.random.default_rng(seed)
+    unit = unit[rows]
+    of_confidence = probability.max(axis=2), correct, unit, terrain, np.random.default_rng(seed)
     return {
         "classes": tuple(str(name) for name in classes),
         "n_windows": len(terrain),
@@ -325,7 +324,7 @@ def held_out_figures(held_out: HeldOut, windows: Windows, group: Array, seed: in
         **{name: float(np.mean(each)) for name, each in means.items()},
         "accuracy_spread": float(np.std(means["accuracy"], ddof=1)) if len(repeats) > 1 else None,
         "accuracy_per_repeat": tuple(means["accuracy"]),
-        "accuracy_ci": run_bootstrap(correct.mean(axis=0), run_id, terrain, np.random.default_rng(seed)),
+        "accuracy_ci": accuracy_interval(correct.mean(axis=0), unit, terrain, np.random.default_rng(seed)),
         "macro_run_accuracy": float(np.mean([np.mean(each) for each in of_terrain.values()])),
         "per_class": pooled["per_class"],
         "confusion": pooled["confusion"],
@@ -341,7 +340,7 @@ class ConformalFigures(NamedTuple):
     """What sets of classes hold, of windows whose runs were held out."""
 
     level: float  #: that they were calibrated for
-    #: coverage, coverage_ci: fraction of windows whose set holds their class, with its 95 % interval over runs
+    #: coverage, coverage_ci: fraction of windows whose set holds their class, with its 95 % interval over units
     coverage: float
     coverage_ci: Interval
     coverage_per_run: float  #: mean over runs of the fraction of their windows, the level's own measure
@@ -351,7 +350,7 @@ class ConformalFigures(NamedTuple):
     single_ratio: float
 
 
-def set_figures(held_out: HeldOut, windows: Windows, seed: int) -> ConformalFigures | None:
+def set_figures(held_out: HeldOut, windows: Windows, unit: Array, seed: int) -> ConformalFigures | None:
     """Return the figures of the sets of classes; None where a fold has no threshold."""
     if not held_out.results or any(math.isnan(result.conformal) for result in held_out.results):
         return None
@@ -369,7 +368,7 @@ def set_figures(held_out: HeldOut, windows: Windows, seed: int) -> ConformalFigu
     return ConformalFigures(
         LEVEL,
         float(held.mean()),
-        run_bootstrap(held, run_id, terrain, np.random.default_rng(seed)),
+        accuracy_interval(held, unit[rows], terrain, np.random.default_rng(seed)),
         float(per_run.mean()),
         float(per_run.min()),
         float(sizes.mean()),
@@ -378,8 +377,8 @@ def set_figures(held_out: HeldOut, windows: Windows, seed: int) -> ConformalFigu
 
 
 N_PAIRED_DRAWS = 2000
-#: With fewer runs a bootstrap over runs gives no interval: that of one run would have no width.
-MIN_RUNS = 3
+#: An interval of fewer degrees of freedom, the units less their classes, says nothing: it is not given.
+MIN_FREEDOM = 2
 
 
 class Verdict(StrEnum):
@@ -391,32 +390,32 @@ class Verdict(StrEnum):
 
 
 class Outcome(NamedTuple):
-    """What a classifier made of held-out windows: run and true class (n,), whether it is right, and confidence.
+    """What a classifier made of held-out windows: unit and true class (n,), whether it is right, and confidence.
 
     These two are (repeats, n).
     """
 
-    run_id: Array
+    unit: Array
     terrain: Array
     correct: Array
     confidence: Array
 
     @classmethod
-    def of(cls, held_out: HeldOut, run_id: Array) -> Self:
+    def of(cls, held_out: HeldOut, unit: Array) -> Self:
         """Return what was made of the windows that were held out."""
-        whole = cls(run_id, held_out.truth, held_out.correct, held_out.probability.max(axis=2))
+        whole = cls(unit, held_out.truth, held_out.correct, held_out.probability.max(axis=2))
         return whole.at(np.flatnonzero(held_out.tested))
 
     def at(self, rows: Array) -> Self:
         """Return some of the windows."""
-        run_id, terrain, correct, confidence = self
-        return type(self)(run_id[rows], terrain[rows], correct[:, rows], confidence[:, rows])
+        unit, terrain, correct, confidence = self
+        return type(self)(unit[rows], terrain[rows], correct[:, rows], confidence[:, rows])
 
 
 class Difference(NamedTuple):
-    """A figure of two classifiers; ``difference`` is b minus a, with its ``interval`` of 95 % over runs.
+    """A figure of two classifiers; ``difference`` is b minus a, with its ``interval`` of 95 % over units.
 
-    The interval is NaN where there are fewer runs than :data:`MIN_RUNS`.
+    The interval is NaN where there are too few units by class: less than :data:`MIN_FREEDOM` beyond one a class.
     """
 
     a: float
@@ -424,13 +423,13 @@ class Difference(NamedTuple):
     difference: float
     interval: Interval
     verdict: Verdict
-    n_runs: int
+    n_units: int
 
 
-class RunDifference(NamedTuple):
-    """Accuracies of two classifiers on the windows of one run."""
+class UnitDifference(NamedTuple):
+    """Accuracies of two classifiers on the windows of one run or session."""
 
-    run_id: str
+    unit: str
     terrain: str
     a: float
     b: float
@@ -447,7 +446,7 @@ class Comparison(NamedTuple):
     macro_run_accuracy: Difference
     confidence_auc: Difference
     by_class: dict[str, Difference]
-    by_run: tuple[RunDifference, ...]
+    by_unit: tuple[UnitDifference, ...]
     by_support: Mapping[str, Difference] = MappingProxyType({})
     a: str = ""
     b: str = ""
@@ -474,9 +473,9 @@ def compare_with_first(
 
 
 def compare_outcomes(a: Outcome, b: Outcome, rng: np.random.Generator) -> Comparison:
-    """Return the differences between two classifiers, paired by run; their windows may differ.
+    """Return the differences between two classifiers, paired by unit; their windows may differ.
 
-    ``DataError`` where they were not judged on the same runs and classes.
+    ``DataError`` where they were not judged on the same units and classes.
 
     Examples
     --------
@@ -484,16 +483,16 @@ def compare_outcomes(a: Outcome, b: Outcome, rng: np.random.Generator) -> Compar
     >>> half, all_right = np.tile([True, False], (1, 40)), np.ones((1, 80), dtype=bool)
     >>> worse, better = (Outcome(run, terrain, right, np.full((1, 80), 0.9)) for right in (half, all_right))
     >>> found = compare_outcomes(worse, better, np.random.default_rng(0))
-    >>> found.accuracy.difference, found.accuracy.verdict.value, found.by_class["ice"].n_runs
+    >>> found.accuracy.difference, found.accuracy.verdict.value, found.by_class["ice"].n_units
     (0.5, 'better', 4)
     """
-    pairs = [list(zip(each.run_id.astype(str), each.terrain.astype(str), strict=True)) for each in (a, b)]
+    pairs = [list(zip(each.unit.astype(str), each.terrain.astype(str), strict=True)) for each in (a, b)]
     cells = sorted(set(pairs[0]))
     if cells != sorted(set(pairs[1])):
         other = sorted(set(pairs[0]) ^ set(pairs[1]))[0]
-        raise DataError(f"run {other[0]} ({other[1]}) was judged by one of the two only")
+        raise DataError(f"{other[0]} ({other[1]}) was judged by one of the two only")
     number, terrain = {cell: i for i, cell in enumerate(cells)}, np.array([name for _, name in cells])
-    weights = np.vstack([np.ones(len(cells)), stratified_counts(terrain, N_PAIRED_DRAWS, rng)])
+    weights = Draws.of(np.arange(len(cells)), terrain, N_PAIRED_DRAWS, rng).weights
     parts = {"": np.ones(len(cells))} | {str(name): (terrain == name) * 1.0 for name in np.unique(terrain)}
     figures, rates = [], []
     for each, of_windows in zip((a, b), pairs, strict=True):
@@ -511,30 +510,34 @@ def compare_outcomes(a: Outcome, b: Outcome, rng: np.random.Generator) -> Compar
         rates.append(rate.tolist())
     (parts_a, macro_a, area_a), (parts_b, macro_b, area_b) = figures
     accuracy = {
-        name: _difference(parts_a[name], parts_b[name], int(kept.sum())) for name, kept in parts.items()
+        name: _difference(parts_a[name], parts_b[name], terrain[kept > 0]) for name, kept in parts.items()
     }
     of_all = accuracy.pop("")
-    macro_run, area = (_difference(*each, len(cells)) for each in ((macro_a, macro_b), (area_a, area_b)))
-    by_run = (RunDifference(*cell, *pair) for cell, *pair in zip(cells, *rates, strict=True))
-    return Comparison(of_all, macro_run, area, accuracy, tuple(by_run))
+    macro, area = (_difference(*each, terrain) for each in ((macro_a, macro_b), (area_a, area_b)))
+    by_unit = (UnitDifference(*cell, *pair) for cell, *pair in zip(cells, *rates, strict=True))
+    return Comparison(of_all, macro, area, accuracy, tuple(by_unit))
 
 
 def paired_accuracy(
-    terrain: Array, n_windows: Array, a: Array, b: Array, rng: np.random.Generator
+    unit: Array, terrain: Array, n_windows: Array, a: Array, b: Array, rng: np.random.Generator
 ) -> Difference:
-    """Return the difference of two accuracies of runs (n,), which are drawn within their classes (n,)."""
-    weights = np.vstack([np.ones(len(terrain)), stratified_counts(terrain, N_PAIRED_DRAWS, rng)]) * n_windows
+    """Return the difference of two accuracies of runs (n,), whose units (n,) are drawn within their classes (n,)."""
+    draws = Draws.of(unit, terrain, N_PAIRED_DRAWS, rng)
+    weights = draws.weights[:, draws.place] * n_windows
     of_a, of_b = (weights @ each / weights.sum(axis=1) for each in (a, b))
-    return _difference(of_a, of_b, len(terrain))
+    return _difference(of_a, of_b, terrain[np.unique(draws.place, return_index=True)[1]])
 
 
-def _difference(of_a: Array, of_b: Array, n_runs: int) -> Difference:
-    """Return the difference of figures of which the first is of all runs, the others of bootstrap samples."""
-    draws = of_b[1:] - of_a[1:]
-    known = n_runs >= MIN_RUNS and np.isfinite(draws).any()
-    low, high = percentile_interval(draws) if known else NO_INTERVAL
+def _difference(of_a: Array, of_b: Array, stratum: Array) -> Difference:
+    """Return the difference of figures of which the first is of all units, the others of draws of them.
+
+    ``stratum`` (units,) has the class of each unit.
+    """
+    draws, freedom = of_b[1:] - of_a[1:], freedom_of(stratum)
+    low, high = percentile_interval(draws, freedom=freedom) if freedom >= MIN_FREEDOM else NO_INTERVAL
     verdict = Verdict.BETTER if low > 0 else Verdict.WORSE if high < 0 else Verdict.NOT_DISTINGUISHED
-    return Difference(float(of_a[0]), float(of_b[0]), float(of_b[0] - of_a[0]), (low, high), verdict, n_runs)
+    ends, apart = (low, high), float(of_b[0] - of_a[0])
+    return Difference(float(of_a[0]), float(of_b[0]), apart, ends, verdict, len(stratum))
 
 
 MEAN_SPAN_S = 10.0  #: Novelty scores are averaged over so long: a robot crosses a terrain for longer.
@@ -550,33 +553,30 @@ class LeftOutTerrain(NamedTuple):
 
 
 def unknown_figures(
-    scored: Sequence[Scored], terrain: Array, run_id: Array, start_s: Array, seed: int
+    scored: Sequence[Scored], terrain: Array, groups: Array, start_s: Array, seed: int
 ) -> dict[str, Any]:
     """Return how well a terrain that was never learned is found to be unknown, by name.
 
-    Each terrain is left out in turn: figures are means over the terrains, intervals by bootstrap over runs.  The
+    Each terrain is left out in turn: figures are means over the terrains, intervals by bootstrap over units.  The
     threshold of the score keeps ``known_kept_target`` of the known windows of inner held-out runs.
     """
     terrains = np.unique(terrain)
     of_terrain = {str(t): [each for each in scored if terrain[each.unknown[0]] == t] for t in terrains}
-    run_names, run_of = np.unique(np.char.add(np.char.add(run_id, " "), terrain), return_inverse=True)
-    weights = np.zeros((N_BOOTSTRAP, len(run_names)))
-    for number, name in enumerate(terrains):  # how often each run is drawn, terrain by terrain
-        runs = np.unique(run_of[terrain == name])
-        weights[:, runs] = bootstrap_counts(len(runs), N_BOOTSTRAP, seed + number)
+    drawn = Draws.of(units_of(terrain, groups), terrain, N_BOOTSTRAP, np.random.default_rng(seed))
+    run = np.unique(run_of(groups), return_inverse=True)[1]
     windows, spans, rows = [], [], {}
     for name, parts in of_terrain.items():
         means = []
         for part in parts:  # of the windows that begin in the same 10 s of a run, at the first of their rows
             both = []
             for at, scores in ((part.known, part.known_scores), (part.unknown, part.unknown_scores)):
-                span = np.stack([run_of[at], np.floor(start_s[at] / MEAN_SPAN_S)])
+                span = np.stack([run[at], np.floor(start_s[at] / MEAN_SPAN_S)])
                 _, first, which = np.unique(span, axis=1, return_index=True, return_inverse=True)
                 both.append((at[first], np.bincount(which.ravel(), scores) / np.bincount(which.ravel())))
             (known, known_scores), (unknown, unknown_scores) = both
             means.append(Scored(known, unknown, known_scores, unknown_scores, part.threshold))
-        windows.append(_compare(parts, run_of))
-        spans.append(_compare(means, run_of))
+        windows.append(_compare(parts, drawn.place))
+        spans.append(_compare(means, drawn.place))
         areas = (float(won.sum() / pairs.sum()) for won, pairs in (windows[-1], spans[-1]))
         kept = (
             [each <= part.threshold for part, each in zip(parts, scores, strict=True)]
@@ -586,9 +586,9 @@ def unknown_figures(
     auroc, auroc_10s, accepted, known_kept = np.mean([*rows.values()], axis=0).tolist()
     return {
         "auroc_unknown": auroc,
-        "auroc_unknown_ci": _area_interval(windows, weights),
+        "auroc_unknown_ci": _area_interval(windows, drawn),
         "auroc_unknown_10s": auroc_10s,
-        "auroc_unknown_10s_ci": _area_interval(spans, weights),
+        "auroc_unknown_10s_ci": _area_interval(spans, drawn),
         "unknown_accepted": accepted,
         "known_kept": known_kept,
         "known_kept_target": KNOWN_KEPT,
@@ -596,34 +596,35 @@ def unknown_figures(
     }
 
 
-def _compare(parts: Sequence[Scored], run_of: Array) -> tuple[Array, Array]:
-    """Return, by run of known and unknown windows, how many pairs the unknown one wins, and how many pairs are.
+def _compare(parts: Sequence[Scored], unit: Array) -> tuple[Array, Array]:
+    """Return, by unit of known and unknown windows, how many pairs the unknown one wins, and how many pairs are.
 
     Pairs are of one fold; ties count one half, NaN as unknown.
     """
-    n_runs = int(run_of.max()) + 1
-    won, pairs = np.zeros((2, n_runs, n_runs))
+    n_units = int(unit.max()) + 1
+    won, pairs = np.zeros((2, n_units, n_units))
     for part in parts:
         known_scores, unknown_scores = (
             np.nan_to_num(each, nan=np.inf, posinf=np.inf)
             for each in (part.known_scores, part.unknown_scores)
         )
-        known_run, unknown_run = run_of[part.known], run_of[part.unknown]
-        for run in np.unique(known_run):
-            ordered = np.sort(known_scores[known_run == run])
+        known_unit, unknown_unit = unit[part.known], unit[part.unknown]
+        for one in np.unique(known_unit):
+            ordered = np.sort(known_scores[known_unit == one])
             ranks = sum(np.searchsorted(ordered, unknown_scores, side) for side in ("left", "right"))
-            won[run] += np.bincount(unknown_run, ranks / 2.0, n_runs)
-            pairs[run] += np.bincount(unknown_run, minlength=n_runs) * len(ordered)
+            won[one] += np.bincount(unknown_unit, ranks / 2.0, n_units)
+            pairs[one] += np.bincount(unknown_unit, minlength=n_units) * len(ordered)
     return won, pairs
 
 
-def _area_interval(compared: Sequence[tuple[Array, Array]], weights: Array) -> Interval:
+def _area_interval(compared: Sequence[tuple[Array, Array]], drawn: Draws) -> Interval:
     """Return the interval of the mean area over the terrains that were left out."""
+    weights = drawn.weights[1:]
     draws = np.zeros(len(weights))
     for won, pairs in compared:
         area = np.einsum("dr,rs,ds->d", weights, won, weights, optimize=True)
         draws += area / np.einsum("dr,rs,ds->d", weights, pairs, weights, optimize=True)
-    return percentile_interval(draws / len(compared))
+    return drawn.interval(draws / len(compared))
 
 
 #: A window comes so often: four times as often as terrain has to be known at 1 Hz, an eighth of a window.
@@ -736,12 +737,12 @@ def sequence_figures(tracks: Sequence[Track], seed: int) -> SequenceFigures | No
     counts, delay_s = (np.concatenate(parts) for parts in zip(*(each[:2] for each in tracks), strict=True))
     run = np.array([name for track in tracks for name in track.run], dtype=str)
     terrain = np.concatenate([track.terrain for track in tracks])
-    weights, place = drawn_runs(run, terrain, N_BOOTSTRAP, np.random.default_rng(seed), row_counts)
-    draws = weights[:, place]
+    of_runs = Draws.of(run, terrain, N_BOOTSTRAP, np.random.default_rng(seed))
+    draws = of_runs.weights[:, of_runs.place]
     drawn = dict(zip(COUNTS, (draws @ counts).T, strict=True))
 
     def ratio(numerator: Array, below: str = "all") -> tuple[float, Interval]:
-        value, interval = ratio_over_runs(numerator, drawn[below])
+        value, interval = of_runs.ratio(numerator, drawn[below])
         return math.nan if value is None else value, interval or NO_INTERVAL
 
     changes, found = delay_s[~np.isnan(delay_s)], np.flatnonzero(np.isfinite(delay_s))
@@ -753,7 +754,7 @@ def sequence_figures(tracks: Sequence[Track], seed: int) -> SequenceFigures | No
             return math.nan, NO_INTERVAL
         at = (upto < level * upto[:, -1:]).sum(axis=1)
         drawn_s = np.where(upto[:, -1] > 0, ordered_s[np.minimum(at, len(ordered_s) - 1)], np.nan)
-        return float(np.quantile(ordered_s, level, method="inverted_cdf")), percentile_interval(drawn_s)
+        return float(np.quantile(ordered_s, level, method="inverted_cdf")), of_runs.interval(drawn_s)
 
     of_all = float(np.quantile(changes, 0.9, method="inverted_cdf")) if len(found) else math.inf
     known = of_all if math.isfinite(of_all) else None

@@ -41,7 +41,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import minimize_scalar
 from scipy.special import log_softmax
 
-from terrain.classify.folds import TOO_FEW, inner_splits
+from terrain.classify.folds import TOO_FEW, inner_splits, run_of
 from terrain.classify.grouped import GroupedClassifier
 from terrain.errors import ConfigError, DataError
 from terrain.records import Array, Windows
@@ -668,7 +668,9 @@ class GroupedNetwork(GroupedClassifier):
             total = np.where(known, values, 0.0).sum(axis=(0, 2))
             fills.append(np.repeat(total / np.maximum(known.sum(axis=(0, 2)), 1), each.n_samples))
         fill = np.concatenate(fills)
-        training = Training(columns, np.where(np.isnan(X), fill, X).astype(np.float32), class_index, groups)
+        training = Training(
+            columns, np.where(np.isnan(X), fill, X).astype(np.float32), class_index, run_of(groups)
+        )
         splits = list(inner_splits(y, groups, self.n_inner_folds, self.seed, self.gap))
         if not splits:
             raise DataError(TOO_FEW)

@@ -42,6 +42,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize, minimize_scalar
 from scipy.special import softmax
 
+from terrain.classify.folds import run_of
 from terrain.classify.grouped import GroupedClassifier
 from terrain.errors import DataError
 from terrain.records import Array
@@ -285,6 +286,7 @@ class GroupedResponse(GroupedClassifier):
             moves and all responses are known.
         """
         X, y, groups = self._training_rows(X, y, groups)
+        groups = run_of(groups)
         if not self.columns or sum(self.columns) != X.shape[1]:
             raise DataError(f"the columns of wheels and responses do not describe rows of {X.shape[1]}")
         responses, n = X[:, self.columns[0] :], self.columns[1]

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import log_softmax
 
-from terrain.classify.folds import fold_numbers
+from terrain.classify.folds import fold_numbers, units_of
 from terrain.classify.grouped import GroupedClassifier
 from terrain.classify.network import GroupedNetwork, SampleColumns
 from terrain.classify.svm import CANDIDATES, GroupedSVC
@@ -84,7 +84,7 @@ class GroupedStack(GroupedClassifier):
         if not len(rows):
             raise DataError("no window was held out by both the SVM and the network; add runs")
         held_out, truth = both[:, rows], np.searchsorted(self.classes_, y[rows])
-        run = groups[rows].astype(str)
+        run = units_of(y, groups)[rows]
         crossed = cross_joined(held_out, truth, run, self.seed)
         losses = np.stack([-log_of_truth(each, truth) for each in (*held_out, crossed)])
         used = chosen_of(losses, run) if self.choose else "stack"

@@ -1,5 +1,6 @@
 """What each protocol holds out is on one side of a split, and every window is tested once a repeat."""
 
+from dataclasses import replace
 from zlib import crc32
 
 import numpy as np
@@ -35,11 +36,17 @@ RUNS = [
 ]
 """Six runs in three sessions, five in one session, a single run; of unequal length."""
 
+
+def session_or_run(run):
+    return run.run_id if run.session == "alone" else run.session
+
+
 UNIT = {
-    "grouped": lambda run: run.run_id,
-    "leave-terrain-out": lambda run: run.run_id,
+    "grouped": session_or_run,
+    "grouped-by-run": lambda run: run.run_id,
+    "leave-terrain-out": session_or_run,
     "leave-one-run-out": lambda run: run.run_id,
-    "leave-sessions-out": lambda run: run.run_id if run.session == "alone" else run.session,
+    "leave-sessions-out": session_or_run,
     "leave-regimes-out": lambda run: str(run.streams["commands"].values[0, 0]),
 }
 """What a protocol holds out together; of a terrain with one session, its runs."""
@@ -69,6 +76,19 @@ def test_what_is_held_out_is_whole_and_every_window_is_tested_once_a_repeat(prot
         single = windows.terrain == "MUD"
         train, test = (windows.start_s[rows[single[rows]]] for rows in (fold.train, fold.test))
         assert np.abs(train[:, None] - test).min(initial=np.inf) > windows.length_s
+
+
+def test_few_sessions_are_held_out_one_at_a_time_whatever_the_seed():
+    runs = [
+        commanded(f"{name}_{i}", name, v, f"{name} {i // 2}")
+        for name in ("ICE", "MUD")
+        for i, v in enumerate(SPEEDS)
+    ]
+    samples = samples_under("grouped", runs)
+    assert len(folds_of(samples, "grouped", 5, 0)) == len(folds_of(samples, "leave-sessions-out", 1, 1)) == 6
+    assert set(samples.unit) == {f"{name} {i}" for name in ("ICE", "MUD") for i in range(3)}
+    one_day = samples_under("grouped", [replace(run, session="today") for run in runs])
+    assert set(one_day.unit) == {run.run_id for run in runs}
 
 
 def test_folds_repeat_with_their_seed_and_earlier_repeats_stay():
@@ -127,7 +147,7 @@ def test_what_cannot_be_split_is_refused(drive, drive_all):
         ("published", unlabelled, "no partition of 5 s lies under one label"),
         ("published", few, r"fewer than 5 partitions of 5 s: ASPHALT \(4\), GRASS \(4\), GRAVEL \(4\)"),
         ("grouped", short, r"run r lasts 1\.50 s, shorter than a window of 2 s"),
-        ("leave-sessions-out", unnamed, "name no sessions"),
+        ("leave-sessions-out", unnamed, "no terrain has several sessions"),
         ("slow-fast", unnamed, r"^slow and fast runs are compared on 3 terrains .*GRASS: slow"),
     ):
         with pytest.raises(DataError, match=sentence):

@@ -65,7 +65,10 @@ def test_the_report_has_what_is_promised_and_is_json(report):
     assert sum(levels.values()) == pytest.approx(1)
     lines = str(report).splitlines()
     assert len(lines) <= 25
-    assert re.match(r"\d+\.\d.% of windows classified correctly, whole runs held out \(", lines[0])
+    assert re.match(r"\d+\.\d.% of windows classified correctly \(", lines[0])
+    assert lines[0].endswith(
+        "whole runs held out, within runs that name no session: what another day does is not shown."
+    )
     assert lines[-1].startswith("next: terrain train --data DIR --recipe svm")
     assert report.to_pandas().shape == (3, 5)
 

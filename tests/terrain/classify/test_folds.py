@@ -6,12 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from terrain.classify.folds import (
-    block_groups,
+    divided_units,
     fold_numbers,
     hold_out_runs,
     inner_splits,
     single_run_classes,
     split_runs,
+    units_of,
 )
 from terrain.errors import DataError
 
@@ -39,7 +40,7 @@ def draw_runs(n_runs, rng, dtype=str):
 def test_laws_of_folds(seed, n_runs, n_folds, gap, dtype):
     rng = np.random.default_rng(seed)
     y, groups = draw_runs({f"class {i}": n for i, n in enumerate(n_runs)}, rng, dtype)
-    if len(np.unique(block_groups(y, groups, n_folds))) < n_folds:
+    if len(np.unique(divided_units(y, groups, n_folds))) < n_folds:
         return
     alone = single_run_classes(y, groups)
     assert alone == [f"class {i}" for i, n in enumerate(n_runs) if n == 1]
@@ -64,6 +65,31 @@ def test_laws_of_folds(seed, n_runs, n_folds, gap, dtype):
     assert (tested == 1).all()
     for counts in runs_of_class.values():
         assert max(counts) - min(counts) <= 1  # every class is dealt evenly
+
+
+def test_a_session_is_never_divided_where_its_class_has_several():
+    """Ice has three sessions of two runs, mud one of three, sand one run, and one session has ice and mud."""
+    plan = [
+        ("mon", "a", "ice"),
+        ("mon", "b", "ice"),
+        ("tue", "c", "ice"),
+        ("tue", "d", "ice"),
+        ("wed", "e", "ice"),
+    ]
+    plan += [("wed", "f", "mud"), ("wed", "g", "mud"), ("wed", "h", "mud"), ("s", "s", "sand")]
+    session, run, y = (np.repeat(names, 10) for names in zip(*plan, strict=True))
+    groups = np.stack([session, run], axis=1)
+    of_ice = y == "ice"
+    assert (units_of(y, groups) == session).all()
+    assert (units_of(y[~of_ice], groups[~of_ice]) == run[~of_ice]).all()  # no class has two sessions
+    assert (units_of(y, run) == run).all()
+    unit = divided_units(y, groups, 5)
+    assert (unit[of_ice] == session[of_ice]).all()
+    assert len(set(zip(unit[y == "mud"], run[y == "mud"], strict=True))) == 3  # whole runs
+    assert len(set(unit[y == "sand"])) == 5
+    for train, test in inner_splits(y, groups, 3, 0, 1):
+        assert not set(session[train][of_ice[train]]) & set(session[test][of_ice[test]])
+        assert set(run[train]) & set(run[test]) <= {"s"}
 
 
 def test_different_seeds_give_different_folds_though_runs_are_of_unequal_length():

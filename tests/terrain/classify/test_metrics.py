@@ -11,16 +11,17 @@ from terrain.classify.folds import Fold
 from terrain.classify.held_out import FoldResult, HeldOut, Scored
 from terrain.classify.metrics import (
     STRIDE_S,
+    Draws,
     Outcome,
     Verdict,
     accuracy_at_coverage,
+    accuracy_interval,
     class_figures,
     compare_outcomes,
     confidence_auc,
     enough_runs,
     held_out_figures,
     last_class,
-    run_bootstrap,
     sequence_figures,
     track_of,
     vote,
@@ -71,11 +72,43 @@ def test_the_interval_covers_the_truth_where_a_binomial_one_does_not():
     covered, naive = [], []
     for _ in range(150):
         hits = (rng.random(len(run)) < rng.beta(2.4, 0.6, 36)[run]).astype(float)
-        low, high = run_bootstrap(hits, run_id, terrain, rng)
+        low, high = accuracy_interval(hits, run_id, terrain, rng)
         covered.append(low <= 0.8 <= high)
         naive.append(abs(hits.mean() - 0.8) <= 1.96 * np.sqrt(hits.mean() * (1 - hits.mean()) / len(hits)))
     assert np.mean(covered) >= 0.89  # 0.95 within three standard deviations of 150 tries
     assert np.mean(naive) < 0.75
+
+
+def test_the_interval_over_few_sessions_covers_the_accuracy_of_other_days():
+    """Six sessions of three terrains with an accuracy of their own; percentiles of a plain bootstrap cover less."""
+    rng, session = np.random.default_rng(4), np.repeat(np.arange(9), 40)
+    terrain = np.repeat(["ice", "mud", "snow"], 3)[session]
+    covered, plain = [], []
+    for _ in range(200):
+        hits = (rng.random(len(session)) < rng.beta(8.0, 2.0, 9)[session]).astype(float)
+        low, high = accuracy_interval(hits, session.astype(str), terrain, rng)
+        covered.append(low <= 0.8 <= high)
+        draws = stratified_resamples(hits, session, rng)
+        plain.append(draws[0] <= 0.8 <= draws[1])
+    assert 0.90 <= np.mean(covered) <= 0.99
+    assert np.mean(plain) < np.mean(covered) - 0.05
+
+
+def stratified_resamples(hits, session, rng):
+    """Return the percentiles of means over sessions of which three of three are drawn in each of three terrains."""
+    means = hits.reshape(3, 3, 40).mean(axis=2)
+    drawn = rng.integers(3, size=(2000, 3, 3))
+    return np.quantile(np.take_along_axis(means[None], drawn, axis=2).mean(axis=(1, 2)), [0.025, 0.975])
+
+
+def test_units_are_counted_by_class():
+    run, terrain = np.repeat(["a", "b", "c"], 10), np.repeat(["ice", "mud", "sand"], 10)
+    right = [np.arange(30)[None] % n > 0 for n in (2, 3)]
+    one_a_class = [Outcome(run, terrain, each, np.full((1, 30), 0.9)) for each in right]
+    found = compare_outcomes(*one_a_class, np.random.default_rng(0)).accuracy
+    assert np.isnan(found.interval).all()
+    assert found.verdict is Verdict.NOT_DISTINGUISHED
+    assert np.isnan(accuracy_interval(right[0][0] * 1.0, run, terrain, np.random.default_rng(0))).all()
 
 
 def figures(run_ids, start_s, y, answers, folds):
@@ -86,7 +119,7 @@ def figures(run_ids, start_s, y, answers, folds):
         predicted = np.asarray(answers)[fold.repeat][fold.test]
         results.append(FoldResult(fold, np.where(predicted[:, None] == classes, 0.8, 0.2), {}))
     held_out = HeldOut.of_folds(results, np.array(y))
-    return SimpleNamespace(**held_out_figures(held_out, windows, windows.run_id, 0))
+    return SimpleNamespace(**held_out_figures(held_out, windows, windows.run_id, windows.run_id, 0))
 
 
 def test_figures_of_hand_made_predictions():
@@ -180,19 +213,19 @@ def test_a_classifier_does_not_differ_from_itself_and_the_sign_follows_the_order
     found = forward  # whose figures are those of counting
     assert found.accuracy.a == pytest.approx(a.correct.mean())
     assert found.by_class["ice"].b == pytest.approx(b.correct[:, b.terrain == "ice"].mean())
-    assert found.by_class["ice"].n_runs == 12
-    by_run = {row.run_id: row.a for row in found.by_run}
-    assert by_run["7"] == pytest.approx(a.correct[:, a.run_id == "7"].mean())
-    per_class = [np.mean([row.b for row in found.by_run if row.terrain == name]) for name in ("ice", "mud")]
+    assert found.by_class["ice"].n_units == 12
+    by_unit = {row.unit: row.a for row in found.by_unit}
+    assert by_unit["7"] == pytest.approx(a.correct[:, a.unit == "7"].mean())
+    per_class = [np.mean([row.b for row in found.by_unit if row.terrain == name]) for name in ("ice", "mud")]
     assert found.macro_run_accuracy.b == pytest.approx(np.mean(per_class))
 
 
 def test_windows_may_differ_but_runs_may_not():
     a, b = outcomes(0.0, 1)
-    half = np.arange(len(b.run_id)) % 2 == 0
-    assert compare_outcomes(a, b.at(half), np.random.default_rng(0)).accuracy.n_runs == 24
-    with pytest.raises(DataError, match=r"run 5 \(ice\) was judged by one of the two only"):
-        compare_outcomes(a, b.at(b.run_id != "5"), np.random.default_rng(0))
+    half = np.arange(len(b.unit)) % 2 == 0
+    assert compare_outcomes(a, b.at(half), np.random.default_rng(0)).accuracy.n_units == 24
+    with pytest.raises(DataError, match=r"5 \(ice\) was judged by one of the two only"):
+        compare_outcomes(a, b.at(b.unit != "5"), np.random.default_rng(0))
 
 
 def test_area_by_runs_is_that_of_all_pairs():
@@ -203,8 +236,8 @@ def test_area_by_runs_is_that_of_all_pairs():
     won, pairs = metrics._compare([part], run_of)
     expected = roc_auc_score(np.repeat([0, 1], [40, 30]), np.concatenate([known, new]))
     assert won.sum() / pairs.sum() == pytest.approx(expected)
-    weights = np.ones((50, 7)) + np.random.default_rng(1).multinomial(7, np.full(7, 1 / 7), 50)
-    low, high = metrics._area_interval([(won, pairs)], weights)
+    drawn = Draws.of(run_of, np.repeat(["known", "new"], [40, 30]), 50, np.random.default_rng(1))
+    low, high = metrics._area_interval([(won, pairs)], drawn)
     assert low < expected < high
 
 
