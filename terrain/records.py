@@ -344,8 +344,9 @@ class TargetStatus(StrEnum):
 class SlipTarget(NamedTuple):
     """Slip ratio to aim for on a terrain in a drive state.
 
-    ``status`` is ``unestimated`` (an assumed number), ``estimated`` (learned from ``n_runs`` runs) or
-    ``invalid``.  ``slip_std`` is NaN where it was not estimated.
+    ``status`` is ``unestimated`` (an assumed number), ``estimated`` (learned from ``n_runs`` runs of ``n_sessions``
+    sessions; those that name none are of one) or ``invalid``.  ``slip_std`` is that of a new session where
+    sessions show it, and NaN where it was not estimated.
     """
 
     terrain: str
@@ -355,3 +356,4 @@ class SlipTarget(NamedTuple):
     n_runs: int
     status: TargetStatus
     source: str
+    n_sessions: int = 0

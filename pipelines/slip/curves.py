@@ -12,7 +12,7 @@ from pipelines.report.figure import Band, Figure, Mark, Panel, Points
 from pipelines.report.numbers import enumerated, format_value, plural
 from pipelines.report.results import Progress, as_json, described
 from pipelines.report.tree import Column, Part, Report, Table, Text, sections
-from pipelines.slip.shown import file_name, first_rows, named
+from pipelines.slip.shown import file_name, first_rows, named, within_one_session
 from pipelines.slip.table import SLIP, TARGET, TARGETS, LearnedSlipTable, fields_of, law_marks
 from terrain.control.learned_table import learned_table, run_row, terrain_row
 from terrain.control.slip_table import DRIVE_STATES
@@ -96,6 +96,7 @@ def log_curves(result: LearnedCurves) -> str:
 TERRAINS = (
     Column("terrain", of="terrain"),
     Column("status", of="status"),
+    Column("sessions", of="n_sessions"),
     Column("runs", of="n_runs"),
     Column("peak", SLIP, of="peak_slip"),
     Column("kind", of="peak_status"),
@@ -132,6 +133,7 @@ def report(result: LearnedCurves) -> Report:
         for row in rows
         if row not in assumed
     ]
+    one = {row["terrain"]: row["n_sessions"] == 1 for row in rows if row not in assumed}
     first, all_terrains = first_rows(rows, TERRAINS, f"target slip of {result.robot}")
     parts: list[Part] = [first]
     parts += [
@@ -151,12 +153,14 @@ def report(result: LearnedCurves) -> Report:
     reading = (
         "Traction is the lesser of nine tenths of the peak slip and the slip with the net traction of a start; "
         "steady is where thrust balances the resistance. Where no peak lies within the observed slips (no_peak), "
-        "the slip at 95 % of the largest net traction observed stands in its place. For a terrain without an "
-        f"entry: {fallback}."
+        "the slip at 95 % of the largest net traction observed stands in its place. Intervals are of the mean curve, "
+        "over sessions or, of one session, over its runs. For a terrain without an entry: "
+        f"{fallback}."
     )
     return Report(
         f"Target slips of {result.robot}",
-        f"Target slips of {result.robot} are learned on {len(rows) - len(assumed)} of {len(rows)} terrains, from "
+        f"{within_one_session(one)}Target slips of {result.robot} are learned on {len(rows) - len(assumed)} of "
+        f"{len(rows)} terrains, from "
         f"{plural(result.n_runs, 'run')}{': in traction ' + enumerated(learned) if learned else ''}.",
         result.pictures.get("all_terrains"),
         parts,
@@ -174,7 +178,7 @@ def report(result: LearnedCurves) -> Report:
 def curve_figures(learned: Sequence[LearnedTerrain], robot: str) -> dict[str, Figure]:
     """Return a figure a terrain, by its name, and ``all_terrains`` with all of them."""
     caption = (
-        "Bins of each run with one standard deviation, the law with its 90 % band over runs, the 90 % interval "
+        "Bins of each run with one standard deviation, the law with its 90 % band over sessions, the 90 % interval "
         "of the peak slip, the resistance, and the targets."
     )
     figures, panels = {}, []
@@ -215,7 +219,7 @@ def curve_panel(entry: LearnedTerrain) -> Panel:
             points.append(("target, traction", targets["traction"].slip_ratio, 2))
             points.append(("target, steady", targets["steady"].slip_ratio, 3))
         marks += law_marks(law, curve.slip_range, curve.peak_interval, ratio)
-        marks.append(Band("90 % over runs", slips, low, high, 0))
+        marks.append(Band("90 %", slips, low, high, 0))
         for label, at, colour in points:
             marks.append(Points(label, np.array([at]), law(np.array([at])), colour=colour))
         shown += [ratio, float(high.max())]

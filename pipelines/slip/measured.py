@@ -15,6 +15,7 @@ from pipelines.report.numbers import enumerated, format_value, sentence
 from pipelines.report.results import Progress, described
 from pipelines.report.tree import Column, Part, Report, Table, Text, sections
 from pipelines.slip.estimate import EstimateOptions
+from pipelines.slip.shown import within_one_session
 from pipelines.slip.tracks import Keep, TracksResult
 from terrain.errors import DataError
 from terrain.records import RunLog
@@ -28,7 +29,7 @@ from terrain.slip_learning.measured import (
     measure,
     measured_slip,
     one_robot,
-    surface_slip,
+    surface_slips,
 )
 from terrain.slip_learning.rollers import (
     NO_ROLLERS,
@@ -39,6 +40,7 @@ from terrain.slip_learning.rollers import (
     named_surfaces,
     rollers_of,
 )
+from terrain.slip_learning.sessions import IntervalOf
 
 SHORT_S, SHORT_STRIDE_S = 0.5, 0.1  #: Windows of the stream ``slip`` that runs are written with
 
@@ -87,8 +89,8 @@ def estimate_all(
     found = measure(runs, robot, **asked, delay_s=options.delay_s, progress=progress)
     if not found.slips:
         raise DataError(f"none of {len(runs)} runs has a slip; the first for this: {found.failed[0]}")
-    rng, by_terrain = np.random.default_rng(seed), found.by_terrain()
-    surfaces = tuple(surface_slip(name, own.slips, rng) for name, own in by_terrain.items())
+    by_terrain = found.by_terrain()
+    surfaces = tuple(surface_slips(found, np.random.default_rng(seed)).values())
     predicted = []
     if options.predict:
         cases = slip_cases(found.runs, found.slips, options.window_s)
@@ -119,10 +121,12 @@ def estimate_all(
 
 SURFACES = (
     Column("surface", of=lambda row: row.terrain or UNLABELLED),
+    Column("sessions", of="n_sessions"),
     Column("runs", of="n_runs"),
     Column("windows", of="n_windows"),
     Column("slip", SLIP, of="slip_ratio"),
-    Column("95 % over runs", SLIP, of="interval"),
+    Column("interval", SLIP, of="interval"),
+    Column("of", of="interval_of"),
     Column("quartiles of windows", SLIP, of="spread"),
     Column("std of a window", SLIP, of="std"),
     Column("held-out difference", SLIP, of="held_out"),
@@ -188,9 +192,12 @@ def report(result: MeasuredSlipResult) -> Report:
         parts.append(Text(f"Runs with the stream slip are in {result.out}."))
     reading = (
         "Slip of the body along the direction in which wheels without slip would drive it, in windows of steady "
-        "motion; standing robots have none. A run counts by its median; the held-out difference is the largest "
-        "of a fifth of the runs against the others. An error of the wheels' radius or of the outside "
-        "measurement's scale is not in the intervals: 1 % of it is 0.01 (1 - slip) of slip."
+        "motion; standing robots have none. A session counts by the median of its runs' medians; the held-out "
+        "difference is the largest of a session or, of one session, of a fifth of its runs against the others. "
+        "Intervals are, with 95 %, of a new session (pooled: sessions taken to differ alike on all surfaces), the "
+        "range of two sessions, which contains a third in one case of three, or over the runs of one. An error of "
+        "the wheels' radius or of the outside measurement's scale is not in the intervals: 1 % of it is 0.01 "
+        "(1 - slip) of slip."
     )
     return Report(
         f"Slip of {result.robot}, measured from outside",
@@ -212,7 +219,10 @@ def _answer(result: MeasuredSlipResult) -> str:
     known = [row for row in result.surfaces if np.isfinite(row.slip_ratio)]
     if known:
         slips = [f"{format_value(row.slip_ratio, SLIP)} on {row.terrain or UNLABELLED}" for row in known]
-        return f"{result.robot} slips by {enumerated(slips)}, measured by {sources}."
+        apart = within_one_session(
+            {row.terrain or UNLABELLED: row.interval_of is IntervalOf.ONE_SESSION for row in known}
+        )
+        return f"{apart}{result.robot} slips by {enumerated(slips)}, measured by {sources}."
     if any(row.n_windows for row in result.surfaces):
         return f"No slip is known in steady motion, measured by {sources}."
     return f"No window of {result.window_s:g} s is covered by {sources}; a shorter --window may be."
@@ -224,7 +234,7 @@ def _pictures(
     """Return slip by surface, by run, and by the direction of travel or, of robots that only drive ahead, the turn."""
     names = [terrain or UNLABELLED for terrain in by_terrain]
     low, high = np.array([row.interval for row in surfaces]).T
-    bars = Bars("median, 95 % over runs", names, [row.slip_ratio for row in surfaces], low, high)
+    bars = Bars("mean of sessions and interval", names, [row.slip_ratio for row in surfaces], low, high)
     sideways = isinstance(robot, OmniRobot | SwerveRobot)
     by_run, by_window, rng = [], [], np.random.default_rng(0)
     for place, (name, own) in enumerate(zip(names, by_terrain.values(), strict=True)):
@@ -249,7 +259,9 @@ def _pictures(
 
     every_run, every_window = "The median of each run.", "A window of steady motion a point."
     return {
-        "slip_by_surface": figure("by surface", Panel([bars]), "The median over runs and its 95 % interval."),
+        "slip_by_surface": figure(
+            "by surface", Panel([bars]), "The mean over sessions of the median over runs, and its interval."
+        ),
         "slip_by_run": figure("a run a point", Panel(by_run, "surface"), every_run),
         "slip_by_motion": figure("by how it was driven", windows, every_window, motion),
     }

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.report.figure import Figure
+from pipelines.report.numbers import enumerated
 from pipelines.report.tree import Column, Part, Table
 from terrain.files.atomic import atomic_write
 
@@ -16,6 +17,19 @@ SHOWN_ROWS = 8  #: Rows of a table that is continued in the details
 def named(rows: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return rows of terrains with their names among their values."""
     return [{"terrain": name, **row} for name, row in rows.items()]
+
+
+def within_one_session(one_session: Mapping[str, bool]) -> str:
+    """Return what a report begins with where surfaces, by name, were driven in one session only; empty elsewhere.
+
+    Examples
+    --------
+    >>> within_one_session({"mud": True, "ice": False}), within_one_session({"mud": True})[:19]
+    ('Within one session on mud: what another day does is not shown. ', 'Within one session:')
+    """
+    names = [name for name, one in one_session.items() if one]
+    where = "" if len(names) == len(one_session) else f" on {enumerated(names)}"
+    return f"Within one session{where}: what another day does is not shown. " if names else ""
 
 
 def first_rows(

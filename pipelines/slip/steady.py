@@ -11,7 +11,7 @@ from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from pipelines.report.numbers import enumerated, format_value, plural
 from pipelines.report.results import Progress, described
 from pipelines.report.tree import Column, Part, Report, Table, Text, sections
-from pipelines.slip.shown import named
+from pipelines.slip.shown import named, within_one_session
 from pipelines.slip.table import SLIP, TARGET, TARGETS, LearnedSlipTable, fields_of
 from terrain.control.learned_table import MIN_RUNS, Transfer, learn_surfaces
 from terrain.errors import DataError
@@ -19,6 +19,7 @@ from terrain.logs.run_folders import data_digest
 from terrain.records import RunLog, TargetStatus
 from terrain.robots import Robot
 from terrain.slip_learning.measured import OperatingPoints, measure_steady
+from terrain.slip_learning.sessions import IntervalOf
 
 
 class SteadyTargets(LearnedSlipTable, eq=False, kw_only=True):
@@ -77,9 +78,11 @@ def _assumed(row: Mapping[str, Any]) -> str:
 
 SURFACES = (
     Column("terrain", of="terrain"),
+    Column("sessions", of="slip.n_sessions"),
     Column("runs", of="slip.n_runs"),
     Column("slip", SLIP, of="slip.slip_ratio"),
-    Column("95 %", SLIP, of="slip.interval"),
+    Column("interval", SLIP, of="slip.interval"),
+    Column("of", of="slip.interval_of"),
     Column("current", ".2f", "A", of=lambda row: row["current_a"][0]),
     Column("thrust over load", ".2f", of=lambda row: row["thrust_ratio"][0]),
     *TARGETS,
@@ -98,13 +101,14 @@ TRANSFERS = (
 )
 
 STEADY = (
-    "Steady is the median over runs of the slip in steady motion, where thrust balances resistance; its interval "
-    "is over runs. What is assumed was not measured."
+    "Steady is the mean over sessions of the median over runs of the slip in steady motion, where thrust balances "
+    "resistance. Its interval is, with 95 %, of a new session (pooled: sessions taken to differ alike on all "
+    "surfaces), the range of two sessions, which contains a third in one case of three, or over the runs of one. "
+    "What is assumed was not measured."
 )
 INDEPENDENT = (
-    "The interval of a surface treats runs as independent; runs of one session are less so than it takes them to "
-    "be, and a new session is off by what this shows. No interval is given with a session of fewer than "
-    f"{MIN_RUNS} runs."
+    "How far one session is from another; the interval is over the runs of the two. None is given with a session of "
+    f"fewer than {MIN_RUNS} runs."
 )
 
 
@@ -117,6 +121,11 @@ def report(result: SteadyTargets) -> Report:
         for row in rows
         if np.isfinite(row["slip"].slip_ratio)
     ]
+    one = {
+        row["terrain"]: row["slip"].interval_of is IntervalOf.ONE_SESSION
+        for row in rows
+        if row["slip"].n_sessions
+    }
     title = f"target slip of {result.robot}, measured from outside"
     parts: list[Part] = [Table(SURFACES, rows, title, STEADY)]
     if result.transfers:
@@ -127,7 +136,9 @@ def report(result: SteadyTargets) -> Report:
     steady = f"{n_steady} of {result.n_runs} runs have steady motion"
     return Report(
         f"Target slips of {result.robot}, measured from outside",
-        f"In steady motion {result.robot} slips by {enumerated(slips)}; {steady}." if slips else f"{steady}.",
+        f"{within_one_session(one)}In steady motion {result.robot} slips by {enumerated(slips)}; {steady}."
+        if slips
+        else f"{steady}.",
         result.pictures.get("operating_points"),
         parts,
         sections(
@@ -156,11 +167,11 @@ def operating_figure(
         known = height[np.isfinite(height)]
         if known.size and np.isfinite(slip.interval).all():
             middle = [float(np.median(known))] * 2
-            marks.append(Line(f"{terrain}, 95 %", list(slip.interval), middle, colour))
+            marks.append(Line(f"{terrain}, interval", list(slip.interval), middle, colour))
     return Figure(
         f"Steady slip of {robot}, measured from outside",
         (Panel(marks, label),),
-        "A run a point: its median slip in steady motion. Lines are the median of a surface over its 95 % "
-        "interval over runs. Points of one surface differ in how the robot was driven and are no curve.",
+        "A run a point: its median slip in steady motion. Lines are the median of a surface over the interval of "
+        "its slip. Points of one surface differ in how the robot was driven and are no curve.",
         x_label="slip ratio of the body, median of a run",
     )

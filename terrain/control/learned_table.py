@@ -1,7 +1,7 @@
 """Tables of target slips that runs show: by the slip curves of terrains, or by steady slip measured from outside.
 
 A robot that is driven at a constant speed takes the slip at which thrust balances resistance: the *steady*
-target, with its error over runs.  How much more thrust more slip would give, and where its peak is, such runs
+target, with its error over sessions.  How much more thrust more slip would give, and where its peak is, such runs
 do not show; the targets of traction and braking stay assumed, traction at least just above the steady slip,
 or no robot would start.  What such a target of one session costs in another session of the same surface is measured.
 """
@@ -30,7 +30,7 @@ from terrain.slip_learning.curve import (
     tractive_efficiency,
 )
 from terrain.slip_learning.learn import LearnedTerrain, TerrainRun, learn_terrain, terrain_runs
-from terrain.slip_learning.measured import Measured, OperatingPoints, operating_points, surface_slip
+from terrain.slip_learning.measured import Measured, OperatingPoints, operating_points, surface_slips
 from terrain.terramechanics.soil import load_soil
 
 FALLBACK = "unknown"
@@ -44,8 +44,6 @@ NO_PEAK = (
 )
 FEW_RUNS = f"fewer than {MIN_RUNS} runs with a slip in steady motion"
 BRAKES = "the median slip is negative: the robot is faster than its wheels, downhill or by a wrong radius"
-
-_Z95 = 1.959964
 
 
 def simulated_table(
@@ -79,7 +77,8 @@ def learned_table(learned: Sequence[LearnedTerrain], robot: Robot, name: str) ->
         for state in DRIVE_STATES:
             slip, std, source = entry.targets[state]
             rounded = round(slip, DIGITS), round(std, DIGITS), curve.n_runs
-            numbers[state] = SlipTarget(terrain, state, *rounded, TargetStatus.ESTIMATED, source)
+            rest = TargetStatus.ESTIMATED, source, curve.n_sessions
+            numbers[state] = SlipTarget(terrain, state, *rounded, *rest)
         targets[terrain] = numbers
         estimated.append(numbers)
     if FALLBACK not in targets:
@@ -132,6 +131,7 @@ def curve_entry(curve: SlipCurve, targets: Mapping[str, TargetSlip], robot: Robo
         traction_efficiency_ratio=round(tractive_efficiency(curve, targets["traction"].slip_ratio), 3),
         **energy,
         n_runs=curve.n_runs,
+        n_sessions=curve.n_sessions,
     )
 
 
@@ -160,6 +160,7 @@ def terrain_row(learned: LearnedTerrain, slips: SlipTable) -> dict[str, Any]:
         "status": learned.status,
         "reason": learned.reason or None,
         "n_runs": len(learned.runs_with_bins),
+        "n_sessions": len({run.bins.session for run in learned.runs_with_bins}),
         "n_samples": sum(run.n_samples for run in learned.runs),
         "slip_range": None if math.isnan(learned.slip_range[0]) else _rounded(learned.slip_range),
         "peak_slip": curve and curve.peak_slip_ratio,
@@ -240,7 +241,7 @@ def learn_surfaces(
     transfers : of targets from session to session
     """
     rng, by_terrain = np.random.default_rng(seed), measured.by_terrain()
-    slips = {terrain: surface_slip(terrain, own.slips, rng) for terrain, own in by_terrain.items()}
+    slips = surface_slips(measured, rng)
     targets, reasons = dict[str, dict[str, SlipTarget]](), dict[str, str]()
     for terrain, slip in slips.items():  # steady slip where it was measured, assumed numbers elsewhere
         targets[terrain] = assumed = _assumed(terrain)
@@ -250,9 +251,12 @@ def learn_surfaces(
         if reasons[terrain] is not NO_PEAK:
             continue
         low, high = slip.interval
-        ratio, std = round(slip.slip_ratio, DIGITS), round((high - low) / (2 * _Z95), DIGITS)
-        source = f"median over {slip.n_runs} runs, measured from outside; 95 % {low:.3f} to {high:.3f}"
-        estimated = slip.n_runs, TargetStatus.ESTIMATED, source
+        ratio, std = round(slip.slip_ratio, DIGITS), round(slip.interval_std, DIGITS)
+        source = (
+            f"sessions: {slip.n_sessions}, runs: {slip.n_runs}, measured from outside; {low:.3f} to {high:.3f} "
+            f"({slip.interval_of.words})"
+        )
+        estimated = slip.n_runs, TargetStatus.ESTIMATED, source, slip.n_sessions
         assumed["steady"] = SlipTarget(terrain, "steady", ratio, std, *estimated)
         least = min(ratio + MIN_ABOVE_BALANCE_SLIP, 1.0)
         if assumed["traction"].slip_ratio < least:

@@ -1,8 +1,8 @@
 """Target slip by terrain and drive state, from a YAML table in which every number has its source.
 
 Two forms are read.  That of ``data/target_slip/default.yaml`` is written by hand; a number with runs behind
-it (``n_runs`` and ``slip_std``) is ``estimated``, one without ``unestimated``.  ``terrain learn-slip`` writes
-the other, ``schema: 2``: for one robot, each number with its status, and the curve that the numbers are from.
+it (``n_runs``, ``n_sessions`` and ``slip_std``) is ``estimated``, one without ``unestimated``.  ``terrain learn-slip``
+writes the other, ``schema: 2``: for one robot, each number with its status, and the curve that the numbers are from.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ SCHEMA = 2  #: Newest form that is read, and the one that is written.
 
 _HEADER = """\
 # Target slip on each terrain, positive in traction (s = (w r - v) / max(|w r|, |v|)).
-# Written by terrain learn-slip.  estimated: learned from n_runs runs; unestimated: the runs do not suffice,
-# the number is assumed; invalid: what was learned contradicts itself, the fallback is used instead.
+# Written by terrain learn-slip.  estimated: learned from n_runs runs of n_sessions sessions; unestimated: the runs
+# do not suffice, the number is assumed; invalid: what was learned contradicts itself, the fallback is used instead.
 """
 
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -65,6 +65,9 @@ class CurveEntry:
     braking_energy_jpm: Finite
     steady_energy_jpm: Finite
     n_runs: Annotated[int, Field(strict=True, ge=1)]  #: the curve is fitted to
+    n_sessions: Annotated[int, Field(strict=True, ge=0)] = (
+        0  #: of these runs; those that name none are of one
+    )
 
     def thrust_ratio(self, slip_ratio: Array) -> Array:
         """Return the thrust over load (n,) at each slip (n,)."""
@@ -105,7 +108,7 @@ class SlipTable:
 
     def target_rows(self, terrain: str) -> dict[str, dict[str, Any]]:
         """Return the targets of an entry by drive state, as JSON has them."""
-        keys = ("slip_ratio", "slip_std", "status", "source")
+        keys = ("slip_ratio", "slip_std", "n_sessions", "status", "source")
         return {
             state: {key: getattr(target, key) for key in keys}
             for state, target in self.targets[terrain].items()
@@ -123,6 +126,7 @@ class _Number(BaseModel):
     source: Words
     slip_std: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)] | None = None
     n_runs: Annotated[int, Field(strict=True, ge=0)] = 0
+    n_sessions: Annotated[int, Field(strict=True, ge=0)] = 0
     status: TargetStatus | None = None
 
 
@@ -206,8 +210,13 @@ def _targets(place: str, terrain: str, entry: _Entry) -> dict[str, SlipTarget]:
         status = number.status or (TargetStatus.ESTIMATED if n_runs else TargetStatus.UNESTIMATED)
         if status is TargetStatus.ESTIMATED and n_runs == 0:
             raise ConfigError(f"{where}: status is 'estimated', and no runs are behind it")
+        if number.n_sessions > n_runs:
+            raise ConfigError(
+                f"{where}: n_sessions is {number.n_sessions}, of {n_runs} runs; a session has one or more"
+            )
         std = math.nan if number.slip_std is None else number.slip_std
-        targets[state] = SlipTarget(terrain, state, slip, std, n_runs, status, number.source)
+        rest = status, number.source, number.n_sessions
+        targets[state] = SlipTarget(terrain, state, slip, std, n_runs, *rest)
     steady, traction = targets["steady"].slip_ratio, targets["traction"].slip_ratio
     if steady > traction:
         raise ConfigError(
@@ -241,6 +250,7 @@ def table_content(table: SlipTable) -> dict[str, Any]:
 
 def _number(target: SlipTarget) -> Any:
     learned = {"slip_std": float(target.slip_std), "n_runs": int(target.n_runs)} if target.n_runs else {}
+    learned |= {"n_sessions": int(target.n_sessions)} if target.n_sessions else {}
     status = TargetStatus(target.status).value
     return {"slip_ratio": float(target.slip_ratio), **learned, "status": status, "source": target.source}
 

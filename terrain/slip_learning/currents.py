@@ -159,7 +159,8 @@ class PredictionFigures:
     held_out: str
     n_runs: int  #: n_runs, n_windows: that were predicted
     n_windows: int
-    rms: float  #: rms, rms_interval: error of the slip of the body, and its 95 % interval over runs
+    #: rms, rms_interval: error of the slip of the body, and its 95 % interval over sessions, or over the runs of one
+    rms: float
     rms_interval: tuple[float, float]
     bias: float  #: mean error
     coverage: float  #: ratio of windows whose slip is inside the 95 % interval of its prediction
@@ -241,16 +242,17 @@ def _figures(
     known = np.isfinite(predicted.slip_ratio)
     error = (predicted.slip_ratio - cases.slip)[known]
     inside = ((cases.slip >= predicted.low) & (cases.slip <= predicted.high))[known]
-    run, terrain = cases.run_id[known], cases.terrain[known]
-    names, run_of = np.unique(run, return_inverse=True)
-    squares, counts = np.bincount(run_of, error**2), np.bincount(run_of)
+    run, session, terrain = cases.run_id[known], cases.session[known], cases.terrain[known]
+    unit = np.unique(session if len(np.unique(session)) > 1 else run, return_inverse=True)[1]
+    squares, counts = np.bincount(unit, error**2), np.bincount(unit)
     interval = (np.nan, np.nan)
-    if len(names) > 1:
-        rows = bootstrap_rows(len(names), N_DRAWS, rng)
-        interval = percentile_interval(np.sqrt(squares[rows].sum(axis=1) / counts[rows].sum(axis=1)))
+    if len(counts) > 1:
+        rows = bootstrap_rows(len(counts), N_DRAWS, rng)
+        rms = np.sqrt(squares[rows].sum(axis=1) / counts[rows].sum(axis=1))
+        interval = percentile_interval(rms, freedom=len(counts) - 1)
     return PredictionFigures(
         held_out=name,
-        n_runs=len(names),
+        n_runs=len(np.unique(run)),
         n_windows=len(error),
         rms=float(np.sqrt(np.mean(error**2))),
         rms_interval=interval,

@@ -24,8 +24,9 @@ resistance over load rho.  Its peak slip is
   (:attr:`PeakStatus.NO_PEAK`): on terrain that shears, traction rises monotonically, and more slip gains next
   to nothing.
 
-Its 90 % interval is from a bootstrap over whole runs, so that it contains what differs from run to run,
-whether or not a factor describes it; percentiles are taken further out as a few runs demand (expanded
+Its 90 % interval is from a bootstrap over whole sessions or, of one session, over its runs (which shows nothing of
+another day), so that it contains what differs between them, whether or not a factor describes it: the interval of the
+curve's own peak, not that of a single new session; percentiles are taken further out as a few runs demand (expanded
 percentile interval; Hesterberg, American Statistician 69 (4), 371-386, 2015).
 
 **Targets** for traction, braking and steady motion, with weight W, wheel radius r and bearing friction T_f::
@@ -233,26 +234,37 @@ def fit_curve(law: str, runs: Sequence[RunBins], start: Sequence[float] | None =
 def select_law(runs: Sequence[RunBins]) -> tuple[str, tuple[float, ...], dict[str, Array]]:
     """Return the law that predicts left-out runs better, its parameters, and the scores of each by run.
 
-    A score is the log likelihood of a run under a fit to the others.  ``magic`` is taken where it is better by
-    more than a standard error, since it nearly contains the other.  :data:`NO_CURVE` is a model that does not
-    depend on the slip: the mean of the others' bins.
+    A score is the log likelihood of a run under a fit to other sessions or, of one session, to the other runs.
+    ``magic`` is taken where it is better by more than a standard error, since it nearly contains the other.
+    :data:`NO_CURVE` is a model that does not depend on the slip: the mean of the others' bins.
     """
     of_all = {law: fit_curve(law, runs) for law in LAW_PARAMETERS}
 
     def score(law: str, train: Array, test: Array) -> Array:
-        others, left_out = [runs[i] for i in train], _Pooled([runs[i] for i in test])
-        if law == NO_CURVE:
-            traction = np.concatenate([other.traction_ratio for other in others])
+        others, found = [runs[i] for i in train], []
+        traction = np.concatenate([other.traction_ratio for other in others])
+        theta = () if law == NO_CURVE else fit_curve(law, others, of_all[law])
+        for left_out in (_Pooled([runs[i]]) for i in test):
             f = np.full(len(left_out.slip), float(traction.mean()))
-            variance = left_out.std**2 + float(np.var(traction)) + _MIN_VARIANCE
-            return np.array([left_out.log_likelihood(f, np.zeros_like(f), variance)])
-        theta = fit_curve(law, others, of_all[law])
-        f, slope = left_out.curve(law, theta)
-        return np.array([left_out.log_likelihood(f, slope, left_out.variance(law, theta))])
+            slope, variance = np.zeros_like(f), left_out.std**2 + float(np.var(traction)) + _MIN_VARIANCE
+            if law != NO_CURVE:
+                (f, slope), variance = left_out.curve(law, theta), left_out.variance(law, theta)
+            found.append(left_out.log_likelihood(f, slope, variance))
+        return np.array(found)
 
-    each = np.arange(len(runs))
-    law, scores = select(score, list(LAW_PARAMETERS), each)
-    return law, of_all[law], {**scores, **select(score, [NO_CURVE], each)[1]}
+    fold = np.empty(len(runs), dtype=int)
+    for number, members in enumerate(units(runs)):
+        fold[members] = number
+    law, scores = select(score, list(LAW_PARAMETERS), fold)
+    return law, of_all[law], {**scores, **select(score, [NO_CURVE], fold)[1]}
+
+
+def units(runs: Sequence[RunBins]) -> list[list[int]]:
+    """Return which runs each session has, those that name none as one; each run alone where there is one session."""
+    names = sorted({run.session for run in runs})
+    if len(names) < 2:
+        return [[i] for i in range(len(runs))]
+    return [[i for i, run in enumerate(runs) if run.session == name] for name in names]
 
 
 INTERVAL = 0.9  #: Probability with which an interval contains the peak slip
@@ -333,7 +345,7 @@ def peak_interval(
 
     Parameters
     ----------
-    draws : (m,) peak slips of the bootstrap over runs
+    draws : (m,) peak slips of the bootstrap over sessions, or runs of one
     runs : behind the curve
     peak : of the curve
     tilted_net : net traction at each of an array of slips, of the thrust of the curve times 1 and a tilt a slip
@@ -347,19 +359,19 @@ def peak_interval(
     )
     less, more = (math.hypot(by, QUANTILE * SYSTEMATIC_SLIP_STD) for by in moved)
     beyond = peak.slip_ratio if sharp else slip_range[1] / 2
-    informative = max(2, sum(bool((run.slip_ratio > beyond).any()) for run in runs))
+    informative = max(2, sum(any((runs[i].slip_ratio > beyond).any() for i in unit) for unit in units(runs)))
     return expanded_interval(draws, informative, peak.slip_ratio, (less, more))
 
 
 def expanded_interval(
-    draws: Array, n_runs: int, centre: float, shared: tuple[float, float]
+    draws: Array, n_units: int, centre: float, shared: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the 90 % interval of a slip by its bootstrap draws over ``n_runs`` runs.
+    """Return the 90 % interval of a slip by its bootstrap draws over ``n_units`` sessions, or runs of one.
 
     The percentiles are those of the normal law at ``sqrt(n / (n - 1)) t``, the quantile of Student's law with
     n - 1 degrees of freedom; what all runs share, 90 % below and above, is added in squares.
     """
-    quantile = math.sqrt(n_runs / (n_runs - 1)) * float(stdtrit(n_runs - 1, 0.5 + INTERVAL / 2))
+    quantile = math.sqrt(n_units / (n_units - 1)) * float(stdtrit(n_units - 1, 0.5 + INTERVAL / 2))
     tail = float(ndtr(-quantile))
     low, high = np.quantile(draws, [tail, 1 - tail])
     below, above = max(centre - float(low), 0.0), max(float(high) - centre, 0.0)
@@ -376,7 +388,7 @@ behind by a tenth of the distance 5 s after a start to 1 m/s.  More traction cos
 start lasts."""
 
 MIN_THRUST_RATIO = 0.02  #: Ice gives more: a curve that stays below is one without traction
-N_BOOTSTRAP = 300  #: Draws of the bootstrap over runs
+N_BOOTSTRAP = 300  #: Draws of the bootstrap
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -398,7 +410,8 @@ class SlipCurve:
     working_slip_ratio: float
     working_std: float
     band: Array  #: (3, m) slips, and the 5 and 95 % quantiles of the law over the bootstrap at each
-    n_runs: int  #: the curve is fitted to
+    n_runs: int  #: n_runs, n_sessions: the curve is fitted to
+    n_sessions: int
     #: mean log likelihood of a left-out run, by law; and ``none``, of one thrust for all slips
     scores: Mapping[str, float]
 
@@ -426,7 +439,7 @@ def learn_curve(
     runs : at least :data:`MIN_RUNS` with bins
     resistance_ratio, resistance_std : (runs,) resistance over load of each run and its deviation; NaN where unknown
     rng : of the bootstrap
-    n_bootstrap : how many draws of runs
+    n_bootstrap : how many draws of sessions or, of one, runs
 
     Raises
     ------
@@ -445,7 +458,9 @@ def learn_curve(
 
     peak = net_peak(partial(net, parameters, rho, 0.0), low, high)
     slips, peaks, thrusts, places = np.linspace(0.0, high, 101), [], [], []
-    for drawn in bootstrap_rows(len(runs), n_bootstrap, rng):
+    sessions = units(runs)
+    for rows in bootstrap_rows(len(sessions), n_bootstrap, rng):
+        drawn = [i for row in rows for i in sessions[row]]
         theta = fit_curve(law, [runs[i] for i in drawn], parameters)
         again, _ = weighted_resistance(resistance_ratio[drawn], resistance_std[drawn])
         again = rho if math.isnan(again) else again
@@ -454,7 +469,7 @@ def learn_curve(
         places.append([slip_at(law, theta, again + by) for by in (0.0, WORKING_TRACTION_RATIO)])
     stds = []  # of balance and working slip: that of the draws, and what all runs share
     for column in np.array(places).T:
-        known, spread = column[np.isfinite(column)], math.sqrt(len(runs) / (len(runs) - 1))
+        known, spread = column[np.isfinite(column)], math.sqrt(len(sessions) / (len(sessions) - 1))
         scatter = float(np.std(known)) * spread if len(known) > 1 else math.nan
         stds.append(math.hypot(scatter, SYSTEMATIC_SLIP_STD))
     return SlipCurve(
@@ -471,6 +486,7 @@ def learn_curve(
         working_std=stds[1],
         band=np.vstack([slips, np.quantile(thrusts, [(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], axis=0)]),
         n_runs=len(runs),
+        n_sessions=len({run.session for run in runs}),
         scores={name: float(np.mean(values)) for name, values in scores.items()},
     )
 
@@ -543,7 +559,7 @@ def targets_of(curve: SlipCurve) -> dict[str, TargetSlip]:
     :data:`MIN_ABOVE_BALANCE_SLIP` above steady motion.  Braking is the peak slip mirrored; where there is no peak, at
     most :data:`BRAKING_CAP_SLIP`.
     """
-    n = f"{curve.n_runs} runs, {curve.law}"
+    n = f"{curve.n_runs} runs, {curve.law}{', within one session' if curve.n_sessions == 1 else ''}"
     slip, std, sharp = curve.peak.slip_ratio, curve.peak_std, curve.peak.status is PeakStatus.PEAK
     name = "the peak slip" if sharp else "the slip at 95 % of the largest traction"
     steady = TargetSlip(

@@ -380,6 +380,7 @@ class RunBins(NamedTuple):
     slip_std: Array
     traction_ratio: Array
     traction_std: Array
+    session: str = ""
 
 
 def traction_samples(
@@ -418,7 +419,7 @@ def traction_samples(
     return TractionSamples(*np.array(rows).reshape(-1, 5).T)
 
 
-def run_bins(run_id: str, samples: TractionSamples) -> RunBins:
+def run_bins(run_id: str, samples: TractionSamples, session: str = "") -> RunBins:
     """Return the bins of one run's samples that hold :data:`MIN_IN_BIN` or more."""
     bin_number = np.digitize(samples.slip_ratio, BIN_EDGES)
     rows = []
@@ -435,7 +436,8 @@ def run_bins(run_id: str, samples: TractionSamples) -> RunBins:
         std = math.hypot(noise, floor, float(lag_std.mean()))
         slip_mean_std = math.sqrt(float((slip_std**2).mean()) / n)
         rows.append((slip.mean(), slip_mean_std, traction.mean(), std))
-    return RunBins(run_id, *np.array(rows).reshape(-1, 4).T)
+    slip, slip_std, traction, traction_std = np.array(rows).reshape(-1, 4).T
+    return RunBins(run_id, slip, slip_std, traction, traction_std, session)
 
 
 def slip_range(runs: Sequence[RunBins]) -> tuple[float, float]:

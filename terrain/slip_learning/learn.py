@@ -96,7 +96,7 @@ def terrain_runs(run: RunLog, robot: Robot) -> list[TerrainRun]:
         balance = body_balance(forces, robot, where)
         samples = traction_samples(forces, balance.mass_kg, where, speed_std_mps)
         left_out = {name: int((~met[where]).sum()) for name, met in forces.conditions.items()}
-        bins, n = run_bins(run.run_id, samples), len(samples.slip_ratio)
+        bins, n = run_bins(run.run_id, samples, run.session), len(samples.slip_ratio)
         measured.append(TerrainRun(run.run_id, terrain, bins, balance, left_out, n))
     return measured
 

@@ -63,7 +63,6 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.angles import arcs
-from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
 from terrain.kernels import njit
@@ -76,6 +75,7 @@ from terrain.records import Array, RunLog, SlipTrack
 from terrain.robots import Robot, robot_named
 from terrain.signals import Delay, DelayStatus, common_delay
 from terrain.slip import slip_ratio
+from terrain.slip_learning.sessions import IntervalOf, SessionSlip, session_slips
 
 VELOCITY: tuple[str, ...] = ("velocity_x_mps", "velocity_y_mps")
 """Channels of a receiver's velocity, east and north."""
@@ -672,7 +672,6 @@ def measure_steady(
 
 
 N_FOLDS = 5
-N_DRAWS = 1000
 
 MIN_TURN_RADPS = 0.2  #: Of wheels, from which their yaw rate is compared with that measured from outside
 
@@ -682,15 +681,18 @@ class SurfaceSlip:
     """Slip of a robot on a surface; NaN where it is not known."""
 
     terrain: str  #: name of the surface; empty for runs without a label
-    n_runs: int  #: n_runs, n_windows: with a slip in steady motion
+    n_sessions: int  #: n_sessions, n_runs, n_windows: with a slip in steady motion
+    n_runs: int
     n_windows: int
     n_standing: int  #: windows without a slip because the robot stood, or because it was too uncertain
-    #: slip_ratio, interval: median over runs of the slip of the body, and its 95 % interval over runs
+    #: slip_ratio, interval, interval_of, interval_std: of the body, as of :class:`SessionSlip`
     slip_ratio: float
     interval: tuple[float, float]
+    interval_of: IntervalOf
+    interval_std: float
     spread: tuple[float, float]  #: quartiles of the windows
     std: float  #: median standard deviation of a window's slip
-    held_out: float  #: largest difference of the median of a fifth of the runs from that of the others
+    held_out: float  #: largest difference of the median of a session, or a fifth of the runs of one, from the others
     wheel_slip: tuple[
         float, ...
     ]  #: median of each wheel, positive in traction whichever direction it rolls in
@@ -698,15 +700,24 @@ class SurfaceSlip:
     spinning: tuple[str, ...]  #: runs with a wheel that spins or lifts, and which
 
 
-def surface_slip(terrain: str, runs: Sequence[MeasuredSlip], rng: np.random.Generator) -> SurfaceSlip:
-    """Return what runs on one surface measured, of their windows in steady motion."""
+def surface_slips(measured: Measured, rng: np.random.Generator) -> dict[str, SurfaceSlip]:
+    """Return what runs on each surface measured, by its name, of their windows in steady motion."""
+    by_terrain, of_runs = measured.by_terrain(), dict[str, tuple[Array, Array]]()
+    for terrain, own in by_terrain.items():
+        known = [i for i, slip in enumerate(own.slips) if slip.known.size]
+        medians = [np.median(own.slips[i].body_slip[own.slips[i].known]) for i in known]
+        of_runs[terrain] = np.array(medians), np.array([own.runs[i].session for i in known], dtype=str)
+    slips = session_slips(of_runs, rng)
+    return {
+        name: _surface_slip(name, own.slips, of_runs[name], slips[name]) for name, own in by_terrain.items()
+    }
+
+
+def _surface_slip(
+    terrain: str, runs: Sequence[MeasuredSlip], of_runs: tuple[Array, Array], found: SessionSlip
+) -> SurfaceSlip:
     some = [run for run in runs if run.known.size]
-    of_runs = [run.body_slip[run.known] for run in some]
-    medians, windows = np.array([np.median(slip) for slip in of_runs]), np.concatenate([[], *of_runs])
-    interval = (np.nan, np.nan)
-    if medians.size > 1:
-        draws = medians[bootstrap_rows(medians.size, N_DRAWS, rng)]
-        interval = percentile_interval(np.median(draws, axis=1))
+    windows = np.concatenate([[], *(run.body_slip[run.known] for run in some)])
     low, high = np.quantile(windows, [0.25, 0.75]).tolist() if windows.size else (np.nan, np.nan)
     driven = [run.slip_ratio * np.where(run.wheel_speed_mps < 0.0, -1.0, 1.0) for run in runs]
     wheels = np.concatenate([slip[run.steady] for slip, run in zip(driven, runs, strict=True)])
@@ -717,14 +728,17 @@ def surface_slip(terrain: str, runs: Sequence[MeasuredSlip], rng: np.random.Gene
         turns = turns[np.abs(turns[:, 0]) >= MIN_TURN_RADPS]
     return SurfaceSlip(
         terrain=terrain,
+        n_sessions=found.n_sessions,
         n_runs=len(some),
         n_windows=int(windows.size),
         n_standing=int(sum((~np.isfinite(run.body_slip)).sum() for run in runs)),
-        slip_ratio=_median(medians),
-        interval=interval,
+        slip_ratio=found.slip_ratio,
+        interval=found.interval,
+        interval_of=found.interval_of,
+        interval_std=found.std,
         spread=(low, high),
         std=_median(np.concatenate([run.body_slip_std[run.steady] for run in runs])),
-        held_out=_held_out(medians, some),
+        held_out=_held_out(*of_runs, some),
         wheel_slip=tuple(_median(wheel) for wheel in wheels.T),
         turn_ratio=_median(turns[:, 1] / turns[:, 0]),
         spinning=tuple(
@@ -738,11 +752,14 @@ def _median(values: Array) -> float:
     return float(np.median(known)) if known.size else float("nan")
 
 
-def _held_out(medians: Array, runs: Sequence[MeasuredSlip]) -> float:
+def _held_out(medians: Array, session: Array, runs: Sequence[MeasuredSlip]) -> float:
     """Return the largest difference of a fold's median from that of the rest; NaN with too few runs.
 
-    Folds are dealt in the order of the speed that wheels roll at, then of direction.
+    Folds are sessions; those of one session are dealt in the order of the speed that wheels roll at, then of direction.
     """
+    if len(names := np.unique(session)) > 1:
+        apart = (session == name for name in names)
+        return max(float(abs(np.median(medians[own]) - np.median(medians[~own]))) for own in apart)
     if medians.size < N_FOLDS:
         return float("nan")
     twist = np.array([np.nanmedian(run.rolled_twist, axis=0) for run in runs])

@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MAX_LINES = {"terrain": 45_250, "features": 2_300, "pipelines": 17_400, "tests": 39_400}
+MAX_LINES = {"terrain": 45_400, "features": 2_300, "pipelines": 17_440, "tests": 39_480}
 """Lines of Python, docstrings included."""
 
 

@@ -25,7 +25,7 @@ PRIVATE_WORDS: dict[str, str] = {
     r"swells?|felt|unfelt": "undulation, effective",
     r"(?:steering|steer|leg)[ _]play\w*|play of the": "backlash",
     r"ours": "the controller's name, this project",
-    r"days?": "seeds, trials",
+    r"(?<!another )days?": "seeds, trials",
     r"(?<!motor[ _])drivers?": "controllers",
     r"nobody": "no measurement, nothing, unknown",
     r"unsure|surer|sure(?! that)": "certain",

@@ -41,11 +41,12 @@ def sand_table():
         slip_range_ratio=(0.0, 0.7),
         resistance_std=0.01,
         n_runs=6,
+        n_sessions=2,
         **{f"{name}_ratio": 0.3 for name in RATIOS},
         **{f"{state}_energy_jpm": 90.0 for state in DRIVE_STATES},
     )
     targets = {"unknown": numbers("unknown", math.nan, 0, "unestimated", "median")}
-    targets["sand"] = numbers("sand", 0.01, 6, "estimated", "runs")
+    targets["sand"] = numbers("sand", 0.01, 6, "estimated", "runs", 2)
     return SlipTable("own", "unknown", targets, "agrimaro", {"sand": curve})
 
 
@@ -99,7 +100,7 @@ def test_a_table_of_either_schema_is_read_and_unknown_or_invalid_terrain_falls_b
     table = load_slip_table(write(tmp_path, plain()), robot="agrimaro")
     assert (table.robot, table.lookup("LAVA")) == ("", table.targets["unknown"])
     table = load_slip_table(write(tmp_path, learned()), robot="agrimaro")
-    assert table.lookup("sand")["traction"] == ("sand", "traction", 0.2, 0.01, 6, "estimated", "runs")
+    assert table.lookup("sand")["traction"] == ("sand", "traction", 0.2, 0.01, 6, "estimated", "runs", 2)
     assert table.curves["sand"].peak_interval_ratio == (0.5, 0.7)
     table = load_slip_table(write(tmp_path, changed(learned(), (*SAND, "traction", "status"), "invalid")))
     assert table.lookup("sand") == table.targets["unknown"]
@@ -128,6 +129,7 @@ REFUSED_LEARNED = [
     ((*SAND, "braking", "slip_ratio"), 0.1, "sand, braking: slip_ratio is 0.1; braking slip cannot"),
     ((*SAND, "traction", "status"), "good", "sand: traction.status is 'good'"),
     ((*SAND, "reason"), 3, "sand: reason is 3"),
+    ((*SAND, "traction", "n_sessions"), 7, "sand, traction: n_sessions is 7, of 6 runs"),
     ((*CURVE, "law"), "linear", "sand, curve: law is 'linear'"),
     ((*CURVE, "parameters", "limit_ratio"), ..., "sand, curve: parameters: key 'limit_ratio' is missing"),
     ((*CURVE, "parameters", "shear_ratio"), 0.0, "sand, curve: shear_ratio is 0; 0.001 to 20"),

@@ -11,15 +11,17 @@ from terrain.simulation.plants.planar import Ground
 from terrain.simulation.run import simulate
 from terrain.slip_learning.ground_changes import slip_step
 from terrain.slip_learning.measured import (
+    Measured,
     _misfit,
     estimate_delay,
     measured_slip,
     outside_source,
     spinning_wheels,
-    surface_slip,
+    surface_slips,
     travelled,
     window_rates,
 )
+from terrain.slip_learning.sessions import IntervalOf
 
 HUSKY = load_robot("husky")
 
@@ -158,14 +160,25 @@ def test_a_surface_counts_runs_and_states_how_its_median_carries_over(make_omni_
     rng = np.random.default_rng(2)
     slips = rng.normal(0.3, 0.02, 25)
     runs = [
-        measured_slip(make_omni_run(rng, slip=s, twist=(0.1 * np.cos(i), 0.1 * np.sin(i), 0.0)), robotino)
-        for i, s in enumerate(slips)
+        make_omni_run(rng, slip=s, twist=(0.1 * np.cos(i), 0.1 * np.sin(i), 0.0)) for i, s in enumerate(slips)
     ]
-    found = surface_slip("cork", runs, np.random.default_rng(0))
+    measured = Measured(runs, [measured_slip(run, robotino) for run in runs], {}, [])
+    found = surface_slips(measured, np.random.default_rng(0))["cork"]
+    assert (found.n_sessions, found.interval_of) == (1, IntervalOf.ONE_SESSION)
     assert found.slip_ratio == pytest.approx(np.median(slips), abs=0.005)
     assert found.interval[0] < 0.3 < found.interval[1]
     assert 0.0 < found.held_out < 0.05
     assert (found.n_runs, found.spinning) == (25, ())
+    sessions = [replace(run, session=f"session {i % 5}") for i, run in enumerate(runs)]
+    found = surface_slips(measured._replace(runs=sessions), np.random.default_rng(0))["cork"]
+    assert (found.n_sessions, found.interval_of) == (5, IntervalOf.NEW_SESSION)
+    assert found.held_out == pytest.approx(
+        max(
+            abs(np.median(slips[np.arange(25) % 5 == i]) - np.median(slips[np.arange(25) % 5 != i]))
+            for i in range(5)
+        ),
+        abs=0.005,
+    )
 
 
 def test_what_cannot_be_measured_is_refused_in_one_sentence(make_omni_run, robotino):
