@@ -20,7 +20,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from features.windows import MAX_GAP_PERIODS, TIME_TOLERANCE_S, Layout, WindowRule, cut_at, wheel_speeds
+from features.windows import (
+    MAX_GAP_PERIODS,
+    TIME_TOLERANCE_S,
+    Layout,
+    WindowRule,
+    at_rates,
+    cut_at,
+    wheel_speeds,
+)
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.clocks import readable
 from terrain.estimation.live import Estimate, estimated_values
@@ -58,6 +66,10 @@ class WindowStream:
     Streams that pause for longer may differ in the reason that is counted, and where
     one never comes back, windows that a log would not hold at all are counted as ``gap``.
 
+    Where windows may be resampled, the rate of each stream is judged by its steps in the first window, as the log's is
+    by all of its steps, and :attr:`resampled` says from which; at rates that are too low, all windows are dropped, by
+    the sentence that says so.
+
     A stamp that is further ahead than that, like the first one of a stream, is held back until
     the next sample confirms it, so that one wrong stamp costs one sample and not the rest of the run.  A
     clock that starts again from an earlier time needs a new ``WindowStream``.
@@ -70,6 +82,7 @@ class WindowStream:
     ----------
     dropped : windows dropped so far, by reason (:data:`~features.windows.DROP_REASONS`)
     dropped_samples : samples dropped so far, by stream and reason
+    resampled : in a sentence, each stream whose windows are resampled
 
     Examples
     --------
@@ -94,16 +107,17 @@ class WindowStream:
         self.layout = layout
         self.dropped: Counter[str] = Counter()
         self.dropped_samples: Counter[tuple[str, str]] = Counter()
+        self.resampled: tuple[str, ...] = ()
+        self._own, self._judged, self._refused = layout, not layout.least_hz, ""
         self._n_samples = {name: layout.n_samples(name, rule.length_s) for name in layout.channels}
         if rule.steady is not None:  # refused now and not at the first window
             empty = {name: np.empty((0, len(names), 0)) for name, names in layout.channels.items()}
             wheel_speeds(empty, layout.channels)
         self._period_s = {name: 1 / layout.rate_hz[name] for name in layout.channels}
-        span_s = rule.length_s + rule.step_s + PATIENCE_S
-        self._buffers = {}
-        for name, channels in layout.channels.items():
-            capacity = max(_MIN_BUFFER, math.ceil(BUFFER_MARGIN * span_s * layout.rate_hz[name]))
-            self._buffers[name] = _Buffer(capacity, len(channels))
+        self._buffers = {
+            name: _Buffer(self._capacity(layout.rate_hz[name]), len(channels))
+            for name, channels in layout.channels.items()
+        }
         self._start_s = math.nan  # of window 0, once every stream has begun
         self._next = 0  # number of the window that comes next
         self._due_s = dict.fromkeys(layout.channels, -math.inf)  # no sample before this can finish it
@@ -112,6 +126,26 @@ class WindowStream:
     def due_s(self) -> float:
         """No sample before this time can finish a window; minus infinity before all streams have begun."""
         return min(self._due_s.values())
+
+    def _capacity(self, rate_hz: float) -> int:
+        span_s = self.rule.length_s + self.rule.step_s + PATIENCE_S
+        return max(_MIN_BUFFER, math.ceil(BUFFER_MARGIN * span_s * rate_hz))
+
+    def _take_rates(self) -> None:
+        """Cut from now on at the rates that the first samples have, or drop all windows where these are too low."""
+        self._judged, rate_hz, channels = True, dict(self.layout.rate_hz), self.layout.channels
+        try:
+            for name, buffer in self._buffers.items():
+                if len(buffer.time_s) > 1:
+                    step_s = float(np.median(np.diff(buffer.time_s)))
+                    rate_hz[name] = self.layout.cut_hz(name, 1.0 / step_s)
+                    buffer.capacity = self._capacity(rate_hz[name])
+            self._own = Layout(channels, rate_hz)
+            self._n_samples = {name: self._own.n_samples(name, self.rule.length_s) for name in channels}
+            self._period_s = {name: 1 / rate_hz[name] for name in channels}
+            self.resampled = self.layout.resampled_from(self._own)
+        except DataError as error:
+            self._own, self._refused = self.layout, str(error)
 
     def push(self, stream: str, time_s: float, values: Sequence[float] | Array) -> list[Windows]:
         """Take one sample and return the windows that it completes, each a ``Windows`` of length 1.
@@ -184,18 +218,28 @@ class WindowStream:
         for name, period_s in self._period_s.items():
             self._due_s[name] = start_s + self.rule.length_s - 2 * TIME_TOLERANCE_S - period_s
 
+    def _n_decided(self) -> tuple[int, int]:
+        """Return the numbers of windows that fit, by the formula of `regular_starts`, and that wait no longer."""
+        front_s = max(buffer.last_s for buffer in self._buffers.values())
+        reached_s = min(buffer.last_s + self._period_s[name] for name, buffer in self._buffers.items())
+        n_fit, n_overdue = (
+            math.floor((end_s - self._start_s - self.rule.length_s + TIME_TOLERANCE_S) / self.rule.step_s) + 1
+            for end_s in (reached_s, front_s - PATIENCE_S)
+        )
+        return n_fit, n_overdue
+
     def _advance(self) -> list[Windows]:
         """Decide all windows that can be decided now."""
         if math.isnan(self._start_s):
             return []
         windows, rule, channels = list[Windows](), self.rule, self.layout.channels
-        front_s = max(buffer.last_s for buffer in self._buffers.values())
-        reached_s = min(buffer.last_s + self._period_s[name] for name, buffer in self._buffers.items())
-        # The numbers of windows that fit, by the formula of `regular_starts`, and that wait no longer.
-        n_fit, n_overdue = (
-            int(math.floor((end_s - self._start_s - rule.length_s + TIME_TOLERANCE_S) / rule.step_s) + 1)
-            for end_s in (reached_s, front_s - PATIENCE_S)
-        )
+        n_fit, n_overdue = self._n_decided()
+        if not self._judged and max(n_fit, n_overdue) > 0:
+            self._take_rates()
+            n_fit, n_overdue = self._n_decided()
+        if self._refused and max(n_fit, n_overdue) > self._next:
+            self.dropped[self._refused] += max(n_fit, n_overdue) - self._next
+            self._next = max(n_fit, n_overdue)
         while self._next < max(n_fit, n_overdue):
             start_s, streams = self._start_s + rule.step_s * self._next, {}
             for name, buffer in self._buffers.items():
@@ -206,12 +250,13 @@ class WindowStream:
                     streams[name] = Stream(*samples, channels[name])
             if len(streams) == len(channels):
                 at = np.array([start_s])
-                values, (reason,) = cut_at(streams, at, rule, self.layout)
+                values, (reason,) = cut_at(streams, at, rule, self._own)
                 self._next += 1
                 if reason:
                     self.dropped[str(reason)] += 1
                 else:
                     run_id, unknown = (np.array([name], dtype=object) for name in ("live", ""))
+                    values = at_rates(values, self._own, self.layout, rule.length_s)
                     of_layout = channels, self.layout.rate_hz, rule.length_s
                     windows.append(Windows(values, *of_layout, at, run_id, unknown))
             elif self._next < n_overdue:
@@ -291,6 +336,11 @@ class WindowFeed:
         counts = {f"window: {reason}": n for reason, n in self._stream.dropped.items()}
         counts |= {f"{name}: {why}": n for (name, why), n in self._stream.dropped_samples.items()}
         return counts | {f"{name}: unreadable": n for name, n in self.unreadable.items()}
+
+    @property
+    def resampled(self) -> tuple[str, ...]:
+        """In a sentence, each stream whose windows are resampled."""
+        return self._stream.resampled
 
     @property
     def due_s(self) -> float:

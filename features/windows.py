@@ -1,8 +1,9 @@
 """Windows of equal length over streams of different rates.
 
 A window of length ``L`` that starts at ``t0`` holds, of each stream, the first ``floor(L rate)`` samples
-at or after ``t0``.  Nothing is interpolated: each stream keeps its own rate, and a window holds the samples
-as they were measured.  :func:`cut_at` is the one place where samples are cut; whole logs, the papers'
+at or after ``t0``.  Each stream keeps its own rate, and a window holds the samples as they were measured, but where a
+model takes windows of another rate than a log's: these are cut at the log's rate and resampled one by one
+(:func:`at_rates`).  :func:`cut_at` is the one place where samples are cut; whole logs, the papers'
 partitions and the sample-by-sample form of :mod:`features.stream` all go through it.
 """
 
@@ -10,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -20,6 +21,7 @@ from terrain.logs.samples import refuse_implausible, usable_rows
 from terrain.logs.schema import SIGNAL_SETS, signal_set_of
 from terrain.logs.schema import TIME_TOLERANCE_S as TIME_TOLERANCE_S
 from terrain.records import Array, RunLog, Stream, Windows
+from terrain.signals import resampled
 
 #: Runs whose rates differ by more than this cannot share windows of one length. The clocks of real loggers differ by
 #: up to 4 % (lengths of the two files of a BorealTC run), which alignment turns into rates.
@@ -80,14 +82,20 @@ class WindowCut:
 
     windows: Windows
     dropped: Mapping[str, int]
+    resampled: Mapping[str, int] = field(default_factory=dict)  #: number of runs, by a sentence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """What every run of a data set must bring: channels and rate of each stream that features use."""
+    """What every run of a data set must bring: channels and rate of each stream that features use.
+
+    ``least_hz`` is the lowest rate from which windows of a stream are resampled to its rate; without it, a run must
+    have that rate.
+    """
 
     channels: Mapping[str, tuple[str, ...]]
     rate_hz: Mapping[str, float]
+    least_hz: Mapping[str, float] = field(default_factory=dict)
 
     def n_samples(self, stream: str, length_s: float) -> int:
         """Return how many samples of a stream a window holds; ``DataError`` when fewer than four."""
@@ -98,6 +106,34 @@ class Layout:
                 f"{self.rate_hz[stream]:.4g} Hz; at least 4 are needed"
             )
         return n
+
+    def cut_hz(self, stream: str, rate_hz: float) -> float:
+        """Return the rate at which a stream of some rate is cut: that of its windows, or its own, to two digits.
+
+        ``DataError`` where it is another one that windows are not resampled from.
+        """
+        expected_hz, least_hz = self.rate_hz[stream], self.least_hz.get(stream)
+        if abs(rate_hz / expected_hz - 1) <= MAX_RATE_DEVIATION:
+            return expected_hz
+        if least_hz is None:
+            raise DataError(
+                f"stream {stream!r} runs at {rate_hz:.4g} Hz where {expected_hz:.4g} Hz is expected (within "
+                f"{MAX_RATE_DEVIATION:.0%})"
+            )
+        own_hz = float(f"{rate_hz:.2g}")
+        if not (1 - MAX_RATE_DEVIATION) * least_hz <= own_hz < np.inf:
+            raise DataError(
+                f"stream {stream!r} runs at {rate_hz:.4g} Hz; the model, of windows at {expected_hz:.4g} Hz, needs "
+                f"at least {least_hz:.4g} Hz"
+            )
+        return own_hz
+
+    def resampled_from(self, own: Layout) -> tuple[str, ...]:
+        """Return in a sentence each stream whose windows are resampled from rates at which they are cut."""
+        rates = (
+            (name, own.rate_hz[name], to_hz) for name, to_hz in self.rate_hz.items() if name in own.rate_hz
+        )
+        return tuple(f"{name} resampled from {a:.4g} to {b:.4g} Hz" for name, a, b in rates if a != b)
 
 
 def rows_of(channels: Sequence[str], quantity: str) -> list[int]:
@@ -196,8 +232,9 @@ def shared_layout(own: Layout, other: Layout) -> Layout:
     return Layout(channels, {stream: own.rate_hz[stream] for stream in channels})
 
 
-def check_layout(run: RunLog, layout: Layout) -> None:
-    """Raise ``DataError`` when a run lacks a stream, a channel or the rate of ``layout``."""
+def check_layout(run: RunLog, layout: Layout) -> Layout:
+    """Return the layout at whose rates a run is cut; ``DataError`` when it lacks a stream, a channel or the rate."""
+    rate_hz = {}
     for name, channels in layout.channels.items():
         if name not in run.streams:
             raise DataError(f"run {run.run_id} has no stream {name!r}, which is needed")
@@ -205,11 +242,21 @@ def check_layout(run: RunLog, layout: Layout) -> None:
         missing = [channel for channel in channels if channel not in stream.channels]
         if missing:
             raise DataError(f"run {run.run_id}, stream {name!r}: channel {missing[0]!r} is missing")
-        if not abs(stream.rate_hz / layout.rate_hz[name] - 1) <= MAX_RATE_DEVIATION:
-            raise DataError(
-                f"run {run.run_id}, stream {name!r} runs at {stream.rate_hz:.4g} Hz where "
-                f"{layout.rate_hz[name]:.4g} Hz is expected (within {MAX_RATE_DEVIATION:.0%})"
-            )
+        try:
+            rate_hz[name] = layout.cut_hz(name, stream.rate_hz)
+        except DataError as error:
+            raise DataError(f"run {run.run_id}, {error}") from None
+    return Layout(layout.channels, rate_hz)
+
+
+def at_rates(values: Mapping[str, Array], own: Layout, layout: Layout, length_s: float) -> dict[str, Array]:
+    """Return windows that were cut at a log's rates at those of a layout; each by itself, so that live equals batch."""
+    return {
+        name: each
+        if own.rate_hz[name] == layout.rate_hz[name]
+        else resampled(each, own.rate_hz[name], layout.n_samples(name, length_s), layout.rate_hz[name])
+        for name, each in values.items()
+    }
 
 
 def cut_at(
@@ -328,7 +375,8 @@ def cut_windows(
     Raises
     ------
     DataError
-        if a run lacks a channel, has another rate or an implausible value, or is shorter than a window.
+        if a run lacks a channel, has a rate that windows are not resampled from or an implausible value, or is
+        shorter than a window.
 
     Examples
     --------
@@ -341,8 +389,7 @@ def cut_windows(
     """
     rule = WindowRule() if rule is None else rule
     layout = layout_of(runs) if layout is None else layout
-    for run in runs:
-        check_layout(run, layout)
+    own_layouts = [check_layout(run, layout) for run in runs]
     fastest_s = 1 / max(layout.rate_hz.values())
     if starts_s is None and rule.step_s < (1 - MAX_RATE_DEVIATION) * fastest_s:
         raise ConfigError(
@@ -357,21 +404,23 @@ def cut_windows(
     n_samples = {name: layout.n_samples(name, rule.length_s) for name in layout.channels}
     nothing = {name: np.empty((0, len(names), n_samples[name])) for name, names in layout.channels.items()}
     parts = [windows(nothing, np.empty(0), "", np.empty(0, dtype=object), "")]
-    dropped: Counter[str] = Counter()
-    for run in runs:
+    dropped, changed = Counter[str](), Counter[str]()
+    for run, own in zip(runs, own_layouts, strict=True):
         refuse_implausible(run, layout.channels)
-        if not holds_a_window(run, layout, rule.length_s, skip_short=skip_short):
+        if not holds_a_window(run, own, rule.length_s, skip_short=skip_short):
             dropped["run too short"] += 1
             continue
         if starts_s is None:
-            at = regular_starts(*span_of(run, layout), rule.length_s, rule.step_s)
+            at = regular_starts(*span_of(run, own), rule.length_s, rule.step_s)
         else:
             at = np.asarray(starts_s.get(run.run_id, ()), dtype=float)
-        values, reason = cut_at(run.streams, at, rule, layout)
+        values, reason = cut_at(run.streams, at, rule, own)
+        changed.update(layout.resampled_from(own))
         dropped.update(str(why) for why in reason if why not in ("", "incomplete"))
         kept, at = {name: array[reason == ""] for name, array in values.items()}, at[reason == ""]
+        kept = at_rates(kept, own, layout, rule.length_s)
         parts.append(windows(kept, at, run.run_id, label_windows(run, at, rule.length_s), run.session))
-    return WindowCut(join_windows(parts), dict(dropped))
+    return WindowCut(join_windows(parts), dict(dropped), dict(changed))
 
 
 def join_windows(parts: Sequence[Windows]) -> Windows:
@@ -402,7 +451,9 @@ def labelled(cut: WindowCut) -> WindowCut:
         raise DataError("no window has a terrain label: nothing can be trained or tested")
     if known.all():
         return cut
-    return WindowCut(cut.windows[known], {**cut.dropped, "no single label": int((~known).sum())})
+    return replace(
+        cut, windows=cut.windows[known], dropped={**cut.dropped, "no single label": int((~known).sum())}
+    )
 
 
 def windows_of(

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from enum import StrEnum
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,6 +39,7 @@ MAX_GAP_SIGMAS = 3.0  #: Across a longer gap, in widths of the low-pass, nothing
 #: A search looks at this many instants of a long run; least squares at all of them.
 MAX_SEARCH_SAMPLES = 1500
 N_DRAWS = 200
+LOBES = 16  #: Zeros of a resampling's sinc on either side: its low-pass falls within 6 % of the Nyquist frequency.
 
 
 class DelayStatus(StrEnum):
@@ -184,6 +186,46 @@ def _low_passed(time_s: Array, value: Array, time_constant_s: float, gap_s: floa
         if k > 0 and not step_s > gap_s:
             out[k] = low_pass_step(value[k], value[k - 1], out[k - 1], step_s, time_constant_s)
     return out
+
+
+@lru_cache(maxsize=64)
+def _resampling(n_from: int, n_to: int, step: float) -> Array:
+    """Return weights (n_to, n_from) of even samples for instants ``step`` samples apart, the first at the first."""
+    cutoff = min(1.0, 1.0 / step)  # over the Nyquist frequency of the samples
+    reach = min(math.ceil(LOBES / cutoff), n_from - 1)
+    apart = step * np.arange(n_to)[:, None] - np.arange(-reach, n_from + reach)
+    taper = np.where(np.abs(apart) <= reach, np.cos(0.5 * np.pi * apart / (reach + 1)) ** 2, 0.0)
+    wide = np.sinc(cutoff * apart) * taper
+    wide /= wide.sum(axis=1, keepdims=True)
+    weights: Array = wide[:, reach : reach + n_from].copy()
+    for k in range(1, reach + 1):  # x_-k = 2 x_0 - x_k, so that a ramp goes on
+        for mirrored, edge, inside in ((reach - k, 0, k), (reach + n_from - 1 + k, -1, -1 - k)):
+            weights[:, edge] += 2.0 * wide[:, mirrored]
+            weights[:, inside] -= wide[:, mirrored]
+    return weights
+
+
+def resampled(values: Array, from_hz: float, n: int, to_hz: float) -> Array:
+    """Return ``n`` samples (..., n) at another rate, from the instant of the first, of even samples (..., m).
+
+    They are behind a low-pass at the lower of the two Nyquist frequencies: a sinc of :data:`LOBES` zeros on either
+    side under a cosine squared (Smith, Digital Audio Resampling), mirrored at the ends through the last sample.  One
+    is NaN where those that are known carry less than half of the weight.
+
+    Examples
+    --------
+    >>> resampled(np.arange(6.0), 2.0, 3, 1.0).round(6).tolist()
+    [0.0, 2.0, 4.0]
+    >>> resampled(np.arange(3.0), 1.0, 5, 2.0).round(6).tolist()
+    [0.0, 0.5, 1.0, 1.5, 2.0]
+    """
+    weights = _resampling(values.shape[-1], n, from_hz / to_hz).T
+    known = np.isfinite(values)
+    if known.all():
+        return np.asarray(values @ weights)
+    weight = known @ weights
+    found = np.where(known, values, 0.0) @ weights
+    return np.asarray(np.divide(found, weight, out=np.full(found.shape, np.nan), where=weight >= 0.5))
 
 
 def true_stretches(mask: Array) -> Array:

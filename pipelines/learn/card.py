@@ -28,6 +28,7 @@ from pipelines.learn.model_file import (
     read_model,
     seal,
 )
+from pipelines.learn.rates import accepted
 from pipelines.learn.training_data import TrainedRun
 from pipelines.live.model import ModelInfo, assess
 from pipelines.report.numbers import NOT_KNOWN, enumerated, format_value, sentence
@@ -158,8 +159,8 @@ def limits_of(
     evaluation : on held-out runs
     """
     limits = [
-        f"robots other than {', '.join(info.robots)}, and logs without its channels or with rates that "
-        "differ by more than 5 %",
+        f"robots other than {', '.join(info.robots)}, and logs without its channels or with lower rates "
+        f"({accepted(info.rate_hz, info.least_rate_hz)})",
         f"terrains other than {', '.join(info.classes)}: unless it is refused as unknown, any ground is "
         "taken for one of them",
         "places, weather and sessions that the training runs do not cover: the figures are those of held-out "

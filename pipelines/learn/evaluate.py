@@ -17,6 +17,7 @@ from features.sequences import following
 from features.windows import wheel_stream
 from pipelines.learn.evaluation import CrossvalResult
 from pipelines.learn.parallel import parallel
+from pipelines.learn.rates import right_at
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import FEATURE_RECIPE, EvaluationSettings, RecipeSettings
 from pipelines.report.numbers import format_counts
@@ -101,6 +102,7 @@ def evaluate_recipe(
     progress: Progress = silent,
     computed: tuple[Array, Motion | None] | None = None,
     channels: Sequence[str] = (),
+    lower: Sequence[Array] = (),
 ) -> tuple[CrossvalResult, HeldOut]:
     """Evaluate a recipe on windows by the protocol of the settings; also return its held-out probabilities.
 
@@ -113,6 +115,7 @@ def evaluate_recipe(
     computed : features (n, f) and motion of the windows, where they are there already
     channels : of each feature, where it is to be found what each channel is worth to the fits of the first repeat;
         the classifier is then fitted on all windows, too; not together with extras
+    lower : rows of the windows at lower rates, which these fits classify as well (:mod:`pipelines.learn.rates`)
 
     Raises
     ------
@@ -133,7 +136,9 @@ def evaluate_recipe(
         asks = []
         for fold in folds:
             held = features[fold.test], samples.terrain[fold.test]
-            asks.append(None if fold.repeat else partial(channel_drops, *held, channels, seed, fold.number))
+            at_rates = partial(right_at, [rows[fold.test] for rows in lower], held[1])
+            drops = partial(channel_drops, *held, channels, seed, fold.number)
+            asks.append(None if fold.repeat else partial(_answers, (drops, at_rates)))
     held_out = evaluate(recipe[-1], examples, folds, settings.jobs, protocol, progress, asks, bool(channels))
     found: dict[str, Any] = {}
     notes = []
@@ -167,6 +172,11 @@ def evaluate_recipe(
         **found,
     )
     return replace(result, notes=(*_notes(samples, recipe, settings), *result.notes, *notes)), held_out
+
+
+def _answers(asks: Sequence[Callable[[Any], Any]], fitted: Any) -> tuple[Any, ...]:
+    """Return what a fitted classifier answers to each of some questions."""
+    return tuple(ask(fitted) for ask in asks)
 
 
 def evaluation_of(held_out: HeldOut, samples: Samples, seed: int, **fields: Any) -> CrossvalResult:

@@ -45,7 +45,7 @@ CARD_FILE, TRAINING_FILE = "model_card.md", "training.json"
 FILES = (MODEL_FILE, ONNX_FILE, CARD_FILE, TRAINING_FILE)
 """Files that a manifest may list; what else lies beside them is not read."""
 
-VERSION = 6
+VERSION = 7
 
 FETCH_TIMEOUT_S = 120.0
 
@@ -82,6 +82,7 @@ def model_info(layout: Layout, rule: WindowRule, terrain: Array, **known: Any) -
         steady=rule.steady,
         channels={stream: tuple(names) for stream, names in layout.channels.items()},
         rate_hz=dict(layout.rate_hz),
+        least_rate_hz={},
         run_accuracy={},
         package_version=__version__,
         class_ratio=dict(zip(classes.tolist(), (counts / counts.sum()).tolist(), strict=True)),

@@ -118,6 +118,7 @@ class Predictions(Result):
     unknown_labels: Mapping[str, int] = described("windows by labels that the model was not trained on")
     n_unknown_labels: int = described("their number")
     dropped: Mapping[str, int] = described("windows left out, by reason")
+    resampled: Mapping[str, int] = described("runs with a stream of another rate than the model's, by rates")
     table_name: str = described("table of target slips")
     table: Mapping[str, Mapping[str, Any]] = described(
         "target slips by terrain and drive state, and the entry of the table that they come from"
@@ -200,7 +201,7 @@ def predict(
     Raises
     ------
     DataError
-        if a run lacks a channel or has another rate than the model was trained on.
+        if a run lacks a channel or has a lower rate than the model takes.
     ConfigError
         if the table is for another robot than a run is of.
     """
@@ -230,6 +231,7 @@ def predict(
         unknown_labels=dict(unknown),
         n_unknown_labels=unknown.total(),
         dropped=dict(sum((Counter(cut.dropped) for cut in cuts), Counter())),
+        resampled=dict(sum((Counter(cut.resampled) for cut in cuts), Counter())),
         filtered=tuple(each.run_id for each in runs if needs_filter(model.info, each.streams)),
         table_name=table.name,
         table={
@@ -368,6 +370,7 @@ def _notes(result: Predictions) -> list[Part]:
             for name, count in result.unknown_labels.items()
         },
         f"windows left out: {format_counts(result.dropped)}": result.dropped,
+        f"of so many runs: {format_counts(result.resampled)}": result.resampled,
         f"repaired: {format_counts(result.repaired)}": result.repaired,
         **dict.fromkeys(result.skipped or (), True),
     }

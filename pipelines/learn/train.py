@@ -153,11 +153,14 @@ def train(
         if the data do not suffice, the model could not be stored, or the tracking store fails; a model that
         was trained by then is kept in a folder, which the message names.
     """
+    import numpy as np
+
     from pipelines.data.tracking import TrackingError, code_commit, ui_line
     from pipelines.learn.card import TrainingRecord, limits_of, write_training
     from pipelines.learn.champion import run_accuracies
     from pipelines.learn.evaluate import evaluate_recipe
     from pipelines.learn.model_file import write_model
+    from pipelines.learn.rates import at_lower_rates, least_rates
     from pipelines.learn.tracking import log_training
     from pipelines.learn.training_data import info_of, with_limits
     from pipelines.report.drawing import figure_png
@@ -183,14 +186,17 @@ def train(
     channels = [channel_of(str(name)) for name in recipe[0].get_feature_names_out()]
     network = settings.recipe.partition("@")[0] in NETWORKS
     asked = settings.with_(repeats=1) if network and settings.repeats is None else settings
-    computed = data.rows, data.motion
+    computed, tried = (data.rows, data.motion), list(at_lower_rates(recipe, samples.windows))
     evaluation, held_out = evaluate_recipe(
-        recipe, settings.recipe, samples, asked, progress, computed, channels
+        recipe, settings.recipe, samples, asked, progress, computed, channels, [each.rows for each in tried]
     )
-    drops = [each.found for each in held_out.results if each.found is not None]
-    importance = channel_importance(channels, drops)
+    answers = [(each.fold.test, *each.found) for each in held_out.results if each.found is not None]
+    importance = channel_importance(channels, [drops for _, drops, _ in answers])
+    rows = np.concatenate([test for test, _, _ in answers])
+    lower_right = np.concatenate([right for _, _, right in answers], axis=1)
+    least_hz = least_rates(tried, held_out.correct[0][rows], lower_right, samples.unit[rows])
     recipe.steps[-1] = (recipe.steps[-1][0], held_out.fitted)
-    info = info_of(data, settings, dataset)
+    info = replace(info_of(data, settings, dataset), least_rate_hz=least_hz)
     model, missing = with_limits(recipe, info, samples, data.features, data.motion)
     evaluation = replace(
         evaluation, dataset=dataset, data_digest=data.digest, notes=(*evaluation.notes, *missing, *notes)

@@ -169,7 +169,7 @@ class Classifier(TerrainSource):
 
     def _feed_for(self, model: TerrainModel) -> WindowFeed:
         """Return what cuts the windows of another model: what cuts them now, where both take the same windows."""
-        same = ("channels", "rate_hz", "rule", "filter")
+        same = ("channels", "rate_hz", "least_rate_hz", "rule", "filter")
         if self.model is not None and all(
             getattr(model.info, n) == getattr(self.model.info, n) for n in same
         ):

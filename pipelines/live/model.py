@@ -32,6 +32,9 @@ class ModelInfo:
     steady: SteadyMotion | None = described("limits of steady motion; None where all windows are kept")
     channels: Mapping[str, tuple[str, ...]] = described("channels that a log must have, by stream")
     rate_hz: Mapping[str, float] = described("their rates", "Hz")
+    least_rate_hz: Mapping[str, float] = described(
+        "lowest rates from which they are resampled; their own where none is shown not to matter", "Hz"
+    )
     run_digests: tuple[str, ...] = described("digest of each training run")
     run_accuracy: Mapping[str, float] = described("of each training run when held out, by its digest", "1")
     package_version: str = described("of the package that trained it")
@@ -48,7 +51,7 @@ class ModelInfo:
     @property
     def layout(self) -> Layout:
         """Channels and rates that a log must have."""
-        return Layout(self.channels, self.rate_hz)
+        return Layout(self.channels, self.rate_hz, {**self.rate_hz, **self.least_rate_hz})
 
     @property
     def rule(self) -> WindowRule:

@@ -115,7 +115,7 @@ def windows_of_log(
     Raises
     ------
     DataError
-        if the log lacks what the model or its filter needs, or a stream has another rate.
+        if the log lacks what the model or its filter needs, or a stream has a lower rate than the model takes.
     """
     if not needs_filter(info, run.streams):
         return cut_windows([run], info.rule, layout=info.layout, skip_short=skip_short)
@@ -130,11 +130,11 @@ def windows_of_log(
     names = [name for name in info.channels if name in channels]
     measured = Layout(
         {name: tuple(c for c in info.channels[name] if c in channels[name]) for name in names},
-        {name: info.rate_hz[name] for name in names},
+        *({name: rates[name] for name in names} for rates in (info.rate_hz, info.layout.least_hz)),
     )
-    check_layout(run, measured)
+    own = check_layout(run, measured)
     nothing = cut_windows([], info.rule, layout=info.layout).windows
-    if not holds_a_window(run, measured, info.window_s, skip_short=skip_short):
+    if not holds_a_window(run, own, info.window_s, skip_short=skip_short):
         return WindowCut(nothing, {"run too short": 1})
     found = [nothing]
     for sample in replay(RunLog(run.run_id, run.robot, streams)):
@@ -151,7 +151,7 @@ def windows_of_log(
     reasons = {
         kind.removeprefix("window: "): n for kind, n in feed.dropped.items() if kind.startswith("window: ")
     }
-    return WindowCut(labelled, Counter(reasons))
+    return WindowCut(labelled, Counter(reasons), Counter(feed.resampled))
 
 
 def prior_of(info: ModelInfo) -> Array:

@@ -152,6 +152,42 @@ def test_a_silent_stream_costs_windows_but_no_memory():
     assert [float(window.start_s[0]) for window in found] == np.arange(200, 218.5, 0.5).tolist()
 
 
+LEAST = {"imu": 40.0, "wheels": 5.0}
+
+
+@pytest.mark.parametrize(
+    ("imu_hz", "wheels_hz", "resampled"),
+    [
+        (100.0, 10.0, ("imu resampled from 100 to 50 Hz",)),
+        (40.0, 25.2, ("imu resampled from 40 to 50 Hz", "wheels resampled from 25 to 10 Hz")),
+        (51.0, 9.8, ()),
+    ],
+)
+def test_windows_of_another_rate_are_resampled_live_as_of_the_log(imu_hz, wheels_hz, resampled):
+    layout = Layout(LAYOUT.channels, LAYOUT.rate_hz, LEAST)
+    run = RunLog("a", "husky", steady_log(20.0, imu_hz, wheels_hz))
+    batch = cut_windows([run], RULE, layout=layout)
+    stream, found = streamed(merged(run.streams), RULE, layout)
+    assert_same(batch.windows, found)
+    assert len(found) > 30
+    assert not stream.dropped
+    assert not batch.dropped
+    assert stream.resampled == resampled == tuple(batch.resampled)
+    assert {name: each.shape[2] for name, each in batch.windows.values.items()} == {"imu": 100, "wheels": 20}
+    assert dict(batch.windows.rate_hz) == LAYOUT.rate_hz
+    np.testing.assert_allclose(batch.windows.values["wheels"], 1.0)
+
+
+def test_rates_too_low_are_refused_in_one_sentence_of_a_log_and_live():
+    layout, streams = Layout(LAYOUT.channels, LAYOUT.rate_hz, LEAST), steady_log(20.0, 25.0)
+    sentence = "stream 'imu' runs at 25 Hz; the model, of windows at 50 Hz, needs at least 40 Hz"
+    with pytest.raises(DataError, match=f"run a, {sentence}"):
+        cut_windows([RunLog("a", "husky", streams)], RULE, layout=layout)
+    stream, found = streamed(merged(streams), RULE, layout)
+    assert not found
+    assert dict(stream.dropped) == {sentence: 36}
+
+
 def test_faults_of_the_programmer_are_raised():
     stream = WindowStream(RULE, LAYOUT)
     with pytest.raises(ConfigError, match="no stream 'lidar' in the layout; it has imu, wheels"):

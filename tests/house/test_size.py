@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MAX_LINES = {"terrain": 45_400, "features": 2_300, "pipelines": 17_440, "tests": 39_480}
+MAX_LINES = {"terrain": 45_440, "features": 2_420, "pipelines": 17_570, "tests": 39_620}
 """Lines of Python, docstrings included."""
 
 

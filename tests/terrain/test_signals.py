@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from terrain.signals import DelayStatus, Pair, at_times, common_delay, delay, low_pass, peak, refine_delay
+from terrain.signals import (
+    DelayStatus,
+    Pair,
+    at_times,
+    common_delay,
+    delay,
+    low_pass,
+    peak,
+    refine_delay,
+    resampled,
+)
 
 STEP_S = 0.02
 LAGS_S = np.arange(-1.0, 2.0 + 1e-9, 0.1)
@@ -21,6 +31,29 @@ def hidden_pair(seed, lag_s, rate, gain=0.7):
     measured = gain * late + 0.3 + 0.05 * rng.standard_normal(time_s.size)
     measured[rng.random(time_s.size) < 0.1] = np.nan
     return Pair(time_s, measured, STEP_S, motion, np.gradient(motion, STEP_S), middle_s)
+
+
+@pytest.mark.parametrize(("from_hz", "to_hz"), [(200.0, 100.0), (100.0, 65.0), (15.0, 6.5), (50.0, 100.0)])
+def test_a_resampling_keeps_waves_below_both_nyquist_frequencies_and_no_others(from_hz, to_hz):
+    """A low wave is that wave at the other instants, a ramp goes on to the ends, and a high one leaves nothing."""
+    from_s, to_s = np.arange(0.0, 20.0, 1.0 / from_hz), np.arange(0.0, 20.0 - 1e-9, 1.0 / to_hz)
+    lower_hz, inside = min(from_hz, to_hz) / 2.0, (to_s > 4.0) & (to_s < 16.0)
+
+    def through(signal):
+        return resampled(signal(from_s), from_hz, to_s.size, to_hz), signal(to_s)
+
+    for ratio in (0.1, 0.5, 0.85):
+        found, wave = through(lambda s, f=ratio * lower_hz: np.sin(2 * np.pi * f * s + 0.3))
+        assert np.abs(found - wave)[inside].max() < 0.02
+    found, ramp = through(lambda s: 3.0 - 0.2 * s)
+    np.testing.assert_allclose(found, ramp, atol=1e-5)
+    if to_hz < 0.7 * from_hz:
+        found, _ = through(lambda s: np.sin(2 * np.pi * 1.25 * lower_hz * s))
+        assert np.abs(found[inside]).max() < 0.02
+    holed = np.where(np.arange(from_s.size) // 20 % 3 == 1, np.nan, np.cos(from_s))
+    known = np.isfinite(resampled(np.stack([holed, np.cos(from_s)]), from_hz, to_s.size, to_hz))
+    assert known[1].all()
+    assert 0.4 < known[0].mean() < 0.9
 
 
 @pytest.mark.parametrize(("lag_s", "rate"), [(0.3, 0.0), (-0.4, 0.004), (1.2, -0.003)])

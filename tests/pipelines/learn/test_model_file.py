@@ -145,7 +145,7 @@ def test_a_manifest_of_a_stranger_is_one_sentence(model_dir):
         ("[]", "is damaged"),
         ("[" * 100_000, r"is damaged \(is nested deeper than 32 levels\)"),
         ({"files": ...}, r"is damaged \(files: Field required\)"),
-        ({"version": 99}, "has version 99; version 6 is read here"),
+        ({"version": 99}, "has version 99; version 7 is read here"),
         ({"version": ["x"] * 10**5}, "has version"),
         ({"files": {}}, "its list of files is not that of a model"),
         ({"files": {**files, "../x": "a"}}, "its list of files is not"),

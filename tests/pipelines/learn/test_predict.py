@@ -108,7 +108,7 @@ def test_runs_that_do_not_fit_model_or_table_are_named(model, drive):
     slower = with_stream(run, "wheels", wheels.time_s[::2], wheels.values[::2], wheels.channels)
     fewer = with_stream(run, "wheels", wheels.time_s, wheels.values[:, :3], wheels.channels[:3])
     for other, table, error, fault in (
-        (slower, TABLE, DataError, "run r, stream 'wheels' runs at 5 Hz where 10 Hz is expected"),
+        (slower, TABLE, DataError, "run r, stream 'wheels' runs at 5 Hz; the model, of windows at 10 Hz, "),
         (fewer, TABLE, DataError, "run r, stream 'wheels': channel 'current_right_a' is missing"),
         (short, TABLE, DataError, r"run s lasts 1\.00 s, shorter than a window of 2 s"),
         (run, replace(TABLE, robot="agrimaro"), ConfigError, "for robot 'agrimaro', run r is of 'husky'"),
@@ -117,6 +117,33 @@ def test_runs_that_do_not_fit_model_or_table_are_named(model, drive):
             predict([run, other], model, table)
     skipped = predict([run, short], model, replace(TABLE, robot="husky"), skip_short=True)
     assert (skipped.n_windows, skipped.dropped) == (12, {"run too short": 1})
+
+
+def test_a_log_of_another_rate_is_resampled_down_to_the_least_that_the_model_has(model, drive):
+    run = drive("r", "GRASS", 4)
+    wheels, imu = run.streams["wheels"], run.streams["imu"]
+    twice_s = np.linspace(wheels.time_s[0], wheels.time_s[-1], 2 * wheels.time_s.size - 1)
+    twice = np.stack([np.interp(twice_s, wheels.time_s, column) for column in wheels.values.T], axis=1)
+    faster = with_stream(run, "wheels", twice_s, twice, wheels.channels)
+    slower = with_stream(faster, "imu", imu.time_s[::2], imu.values[::2], imu.channels)
+    to_hz = f"{model.info.rate_hz['imu']:.4g}"
+    for log, least_hz, resampled in (
+        (faster, {}, {"wheels resampled from 20 to 10 Hz": 1}),
+        (
+            slower,
+            {"imu": 25.0},
+            {"wheels resampled from 20 to 10 Hz": 1, f"imu resampled from 25 to {to_hz} Hz": 1},
+        ),
+    ):
+        taking = model._replace(info=replace(model.info, least_rate_hz=least_hz))
+        found = predict([run, log], taking, TABLE)
+        assert (found.n_windows, found.resampled) == (
+            23,
+            resampled,
+        )  # the faster one ends a half sample earlier
+        assert "resampled from 20 to 10 Hz" in str(found.report)
+    with pytest.raises(DataError, match="run r, stream 'imu' runs at 25 Hz"):
+        predict([slower], model, TABLE)
 
 
 def test_the_filtered_terrain_is_that_of_the_run_so_far(model, giving, drive):
