@@ -3,8 +3,8 @@
 Sources: Efron and Tibshirani, An Introduction to the Bootstrap (1993), 13.3 (percentile interval).  Of few units a
 bootstrap within strata is too narrow twice: drawing n of n gives (n - 1) / n of the variance, which n - 1 draws of
 weight n / (n - 1) mend (Rao and Wu 1988, Resampling inference with complex survey data), and percentiles are those of
-a normal distribution, not Student's t, which percentiles further out mend (Hesterberg 2015, What teachers should know
-about the bootstrap, 4.2).
+a normal distribution, not Student's t, which percentiles further out mend (Hesterberg 2015,
+The American Statistician 69, 371, 4.2).
 """
 
 from __future__ import annotations

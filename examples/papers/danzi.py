@@ -18,7 +18,7 @@ from features.extractor import FeatureExtractor
 from features.windows import cut_windows, join_windows
 from pipelines.report.figure import Band, Figure, Line, Panel
 from terrain.classify.folds import split_runs
-from terrain.classify.metrics import run_bootstrap
+from terrain.classify.metrics import accuracy_interval
 from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.constants import GRAVITY_MPS2
 from terrain.control.pid import (
@@ -755,7 +755,7 @@ def classify_terrain(trial: Trial) -> Finding:
     correct = by_run.argmax(axis=1) == true
     recall = {str(name): float(correct[true == i].mean()) for i, name in enumerate(classes)}
     weakest, accuracy = min(recall, key=lambda name: recall[name]), float(correct.mean())
-    low, high = run_bootstrap(correct, run_id, true, np.random.default_rng(seed))
+    low, high = accuracy_interval(correct, run_id, true, np.random.default_rng(seed))
     geometry = robot.wheel_radius_m, robot.body.tyre_width_m, robot.body.contact_length_m
     load_n = robot.mass_kg * GRAVITY_MPS2 / len(robot.wheels)
     responses = {name: response_of(load_soil(name), load_n, *geometry) for name in soil_names()}

@@ -87,8 +87,8 @@ def test_few_sessions_are_held_out_one_at_a_time_whatever_the_seed():
     samples = samples_under("grouped", runs)
     assert len(folds_of(samples, "grouped", 5, 0)) == len(folds_of(samples, "leave-sessions-out", 1, 1)) == 6
     assert set(samples.unit) == {f"{name} {i}" for name in ("ICE", "MUD") for i in range(3)}
-    one_day = samples_under("grouped", [replace(run, session="today") for run in runs])
-    assert set(one_day.unit) == {run.run_id for run in runs}
+    of_one = samples_under("grouped", [replace(run, session="today") for run in runs])
+    assert set(of_one.unit) == {run.run_id for run in runs}
 
 
 def test_folds_repeat_with_their_seed_and_earlier_repeats_stay():

@@ -18,7 +18,7 @@ RATE_HZ, TIME_S = 50.0, np.arange(0.0, 16.0, 0.02)
 
 
 def drawn_run(number, rng, band_hz):
-    """A run whose terrain is told by the size of one of two waves, that in the band."""
+    """A run whose terrain is distinguished by the size of one of two waves, that in the band."""
     terrain = "ice" if number % 2 else "mud"
     waves = sum(
         (3.0 if f == band_hz and terrain == "ice" else 1.0)

@@ -79,7 +79,7 @@ def test_the_interval_covers_the_truth_where_a_binomial_one_does_not():
     assert np.mean(naive) < 0.75
 
 
-def test_the_interval_over_few_sessions_covers_the_accuracy_of_other_days():
+def test_the_interval_over_few_sessions_covers_the_accuracy_of_others():
     """Six sessions of three terrains with an accuracy of their own; percentiles of a plain bootstrap cover less."""
     rng, session = np.random.default_rng(4), np.repeat(np.arange(9), 40)
     terrain = np.repeat(["ice", "mud", "snow"], 3)[session]
