@@ -245,6 +245,7 @@ def samples_of(
     speed_mps: tuple[float, float] | None = None,
     merge_duplicates: bool = False,
     skip_short: bool = False,
+    rate_hz: Mapping[str, float] | None = None,
 ) -> Samples:
     """Cut the labelled windows that a protocol asks for, of distinct runs, with their groups.
 
@@ -253,6 +254,7 @@ def samples_of(
     speed_mps : only runs that were driven between these speeds
     merge_duplicates : whether runs that hold the same measurements are one run, in place of being refused
     skip_short : whether runs shorter than a window are left out and counted
+    rate_hz : of streams whose windows are resampled to a lower rate
 
     Raises
     ------
@@ -270,7 +272,8 @@ def samples_of(
         raise ConfigError(
             f"a window of {rule.length_s:g} s does not fit into a partition of {PARTITION_S:g} s"
         )
-    layout = layout_of(distinct, signal_sets, speeds=rule.steady is not None and not is_published)
+    speeds = rule.steady is not None and not is_published
+    layout = layout_of(distinct, signal_sets, speeds=speeds, rate_hz=rate_hz)
     if is_published:
         # slid inside partitions of 5 s, that with the fewest of a class every 0.1 s, the others in proportion to their
         # number, so that classes are balanced; no rule of steady motion is applied

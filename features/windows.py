@@ -124,7 +124,7 @@ class Layout:
         if not (1 - MAX_RATE_DEVIATION) * least_hz <= own_hz < np.inf:
             raise DataError(
                 f"stream {stream!r} runs at {rate_hz:.4g} Hz; the model, of windows at {expected_hz:.4g} Hz, needs "
-                f"at least {least_hz:.4g} Hz"
+                f"at least {least_hz:.4g} Hz; one that is trained with --rate {stream}={own_hz:g} takes it"
             )
         return own_hz
 
@@ -174,25 +174,31 @@ def wheel_speeds(values: Mapping[str, Array], channels: Mapping[str, tuple[str, 
 
 
 def layout_of(
-    runs: Sequence[RunLog], signal_sets: Iterable[str] = SIGNAL_SETS, *, speeds: bool = True
+    runs: Sequence[RunLog],
+    signal_sets: Iterable[str] = SIGNAL_SETS,
+    *,
+    speeds: bool = True,
+    rate_hz: Mapping[str, float] | None = None,
 ) -> Layout:
     """Return the streams, channels and rates that all runs have in common.
 
     Only channels of the chosen signal sets count, and wheel speeds besides where ``speeds`` says that the
     rule of steady motion needs them: what is not used cannot drop a window.  The rate is the median over
-    runs.
+    runs; that of streams with a ``rate_hz`` of their own, from which windows are resampled, may be higher.
 
     Raises
     ------
     DataError
         if there is no run, a run lacks a channel that others have, or its rate differs by over 5 %.
+    ConfigError
+        if a rate is given of a stream that is not used.
     """
     if not runs:
         raise DataError("there is no run to cut windows from")
     desired_sets = frozenset({*signal_sets, *(("wheels",) if speeds else ())})
 
     channels: dict[str, tuple[str, ...]] = {}
-    rate_hz: dict[str, float] = {}
+    rates_hz, lower_hz = dict[str, float](), dict(rate_hz or {})
     used = [
         {
             name: tuple(stream.channels[i] for i in rows)
@@ -211,8 +217,10 @@ def layout_of(
                 raise DataError(
                     f"run {run.run_id}, stream {name!r}: channel {differing[0]!r} is not in all runs"
                 )
-        rate_hz[name] = float(np.median([run.streams[name].rate_hz for run in runs]))
-    layout = Layout(channels, rate_hz)
+        rates_hz[name] = lower_hz.get(name, float(np.median([run.streams[name].rate_hz for run in runs])))
+    if unused := sorted(set(lower_hz) - set(channels)):
+        raise ConfigError(f"a rate is given of stream {unused[0]!r}; {', '.join(channels)} are used")
+    layout = Layout(channels, rates_hz, lower_hz)
     for run in runs:
         check_layout(run, layout)
     if not channels:

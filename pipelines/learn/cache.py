@@ -116,7 +116,8 @@ def cached_data(
     chosen = sorted(chosen, key=lambda head: head.run_id)
     unfitted = recipe_of(settings, settings.recipes[0])
     extractor, signal_sets = unfitted[0], unfitted[0].signal_sets
-    layout = layout_of([head.sketch() for head in chosen], signal_sets, speeds=rule.steady is not None)
+    sketches, rate_hz = [head.sketch() for head in chosen], settings.reading["rate_hz"]
+    layout = layout_of(sketches, signal_sets, speeds=rule.steady is not None, rate_hz=rate_hz)
     extractor.fit(cut_windows([], rule, layout=layout).windows)
     names = extractor.get_feature_names_out().tolist()
     made_of = _sha256([FORMAT_VERSION, __version__, as_json([rule, layout, signal_sets, names])])

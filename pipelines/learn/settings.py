@@ -71,6 +71,31 @@ def split_recipes(texts: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(map(check_recipe, found))
 
 
+def stream_rate(text: str) -> tuple[str, float]:
+    """Return stream and rate in Hz of a text; ``ConfigError`` where it is none.
+
+    Examples
+    --------
+    >>> stream_rate("imu=50")
+    ('imu', 50.0)
+    """
+    stream, _, rate = text.partition("=")
+    try:
+        rate_hz = float(rate)
+    except ValueError:
+        rate_hz = math.nan
+    if not (stream and 0.0 < rate_hz < math.inf):
+        raise ConfigError(f"--rate is {text!r}; STREAM=HZ is required, as in imu=50")
+    return stream, rate_hz
+
+
+def check_rates(texts: tuple[str, ...]) -> tuple[str, ...]:
+    """Raise ``ConfigError`` where a text is no stream with a rate."""
+    for text in texts:
+        stream_rate(text)
+    return texts
+
+
 class WindowSettings(Settings):
     """Windows: how runs are cut, and which signals are used."""
 
@@ -84,6 +109,8 @@ class WindowSettings(Settings):
     merge_duplicates: bool = setting(False)
     """Treat runs that hold the same measurements as one run instead of refusing them."""
     skip_short: bool = setting(False, "Leave out and count runs shorter than a window.", option="")
+    rate: Annotated[tuple[str, ...], AfterValidator(check_rates)] = setting((), repeated=True)
+    """STREAM=HZ: resample the windows of a stream to a lower rate, from which the model takes logs then."""
 
     @property
     def rule(self) -> WindowRule:
@@ -97,7 +124,8 @@ class WindowSettings(Settings):
     @property
     def reading(self) -> dict[str, Any]:
         """How runs are taken, as :func:`features.protocols.samples_of` has it."""
-        return {"merge_duplicates": self.merge_duplicates, "skip_short": self.skip_short}
+        rate_hz = dict(map(stream_rate, self.rate))
+        return {"merge_duplicates": self.merge_duplicates, "skip_short": self.skip_short, "rate_hz": rate_hz}
 
 
 class LearnSettings(WindowSettings, JobsSettings):

@@ -180,7 +180,8 @@ def test_windows_of_another_rate_are_resampled_live_as_of_the_log(imu_hz, wheels
 
 def test_rates_too_low_are_refused_in_one_sentence_of_a_log_and_live():
     layout, streams = Layout(LAYOUT.channels, LAYOUT.rate_hz, LEAST), steady_log(20.0, 25.0)
-    sentence = "stream 'imu' runs at 25 Hz; the model, of windows at 50 Hz, needs at least 40 Hz"
+    sentence = "stream 'imu' runs at 25 Hz; the model, of windows at 50 Hz, needs at least 40 Hz; one that is trained "
+    sentence += "with --rate imu=25 takes it"
     with pytest.raises(DataError, match=f"run a, {sentence}"):
         cut_windows([RunLog("a", "husky", streams)], RULE, layout=layout)
     stream, found = streamed(merged(streams), RULE, layout)

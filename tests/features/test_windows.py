@@ -137,3 +137,5 @@ def test_rules_that_mean_nothing_and_runs_that_do_not_fit_together_are_refused_b
     assert reason.tolist() == ["", "not finite", "", ""]
     with pytest.raises(DataError, match="there is no run"):
         layout_of([])
+    with pytest.raises(ConfigError, match=r"a rate is given of stream 'lidar'; .*wheels.* are used"):
+        layout_of([run], rate_hz={"lidar": 10.0})

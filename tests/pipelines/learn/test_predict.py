@@ -170,3 +170,26 @@ def test_predictions_are_written_by_the_ending_of_the_file(tracked, drive, tmp_p
     assert table["terrain_set"].tolist() == [" ".join(row.terrain_set) for row in result.windows]
     assert {"run_id", "start_s", "probability", "status_traction"} <= set(table.columns)
     assert "of 12 labelled ones are right" in result.report.answer
+
+
+def test_a_model_of_windows_at_a_lower_rate_takes_logs_from_there_on(runs, drive):
+    """For a slower robot: trained on windows that were resampled to its rate, as they are live."""
+    few = [run for run in runs if run.run_id[-1] in "12"]
+    model = fitted_model(few, RecipeSettings(rate=("imu=25",)))
+    assert model.info.rate_hz["imu"] == 25.0
+    log = drive("r", "GRASS", 4)
+    imu = log.streams["imu"]
+    slower = with_stream(log, "imu", imu.time_s[::2], imu.values[::2], imu.channels)
+    (sentence,) = predict([log, slower], model, TABLE).resampled.items()
+    assert sentence == ("imu resampled from 50 to 25 Hz", 1)
+    for text, fault in (
+        ("imu", "STREAM=HZ is required, as in imu=50"),
+        ("imu=-1", "STREAM=HZ"),
+        ("=9", "STREAM=HZ"),
+    ):
+        with pytest.raises(ConfigError, match=fault):
+            RecipeSettings(rate=(text,))
+    with pytest.raises(
+        DataError, match="runs at 50 Hz; the model, of windows at 80 Hz, needs at least 80 Hz"
+    ):
+        fitted_model(few, RecipeSettings(rate=("imu=80",)))
