@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -13,9 +13,9 @@ import numpy as np
 from features.windows import Layout, WindowRule, cut_windows, regular_starts, span_of
 from terrain.classify.folds import Fold
 from terrain.classify.metrics import STRIDE_S, Track, last_class, track_of
-from terrain.classify.terrain_filter import check_prior, filter_run, reported
+from terrain.classify.terrain_filter import FilterSettings, choose_settings, filter_run, reported
 from terrain.logs.splicing import order_stretches, parts_under, splice_runs, stretches_of
-from terrain.records import RunLog, Windows
+from terrain.records import Array, RunLog, Windows
 
 #: A log over several grounds; the run behind each of its labels, and whether it was spliced.
 SplicedRun = tuple[RunLog, tuple[str, ...], bool]
@@ -26,15 +26,15 @@ def follow(
     sequences: Sequence[SplicedRun],
     rule: WindowRule,
     layout: Layout,
-    prior: Mapping[str, float],
+    classes: Array,
+    choose: Callable[[Any], FilterSettings | None],
     classifier: Any,
 ) -> list[Track]:
     """Return what a fitted classifier and its filter report along each sequence.
 
-    ``prior`` has the part of each class among the training windows, in order.
+    ``choose`` gives the settings of the filter from the classifier; None to take single windows.
     """
-    classes, tracks, rule = np.array([*prior]), [], replace(rule, stride_s=STRIDE_S)
-    shares = check_prior([*prior.values()])
+    settings, tracks, rule = choose(classifier), [], replace(rule, stride_s=STRIDE_S)
     for log, runs, spliced in sequences:
         begin_s, end_s = span_of(log, layout)
         starts_s = regular_starts(begin_s, end_s, rule.length_s, STRIDE_S)
@@ -45,8 +45,10 @@ def follow(
             probability[rows] = 0.0
             found = classifier.predict_proba(np.asarray(features.fit_transform(windows)))
             probability[np.ix_(rows, np.searchsorted(classes, classifier.classes_))] = found
-        belief = filter_run(probability, starts_s + rule.length_s, shares)
-        reports = reported(belief), last_class(probability)
+        single = filtered = last_class(probability)
+        if settings is not None:
+            filtered = reported(filter_run(probability, starts_s + rule.length_s, settings))
+        reports = filtered, single
         tracks.append(track_of(log.labels, runs, starts_s, rule.length_s, *reports, classes, spliced))
     return tracks
 
@@ -81,5 +83,12 @@ def following(
             if n > 1:  # a run over several grounds
                 sequences.append((by_id[name], (name,) * len(by_id[name].labels), False))
         counts = np.bincount(class_of[train], minlength=len(classes)) + 1.0
-        prior = dict(zip(classes.tolist(), (counts / counts.sum()).tolist(), strict=True))
-        yield partial(follow, features, sequences, rule, layout, prior)
+        choose = partial(
+            choose_settings,
+            terrain=windows.terrain[train].astype(str),
+            end_s=windows.start_s[train] + windows.length_s,
+            groups=windows.groups[train],
+            length_s=windows.length_s,
+            prior=dict(zip(classes.tolist(), (counts / counts.sum()).tolist(), strict=True)),
+        )
+        yield partial(follow, features, sequences, rule, layout, classes, choose)

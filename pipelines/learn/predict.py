@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from pipelines.learn.ground_changes import ChangesResult
-    from pipelines.live.model import TerrainModel
+    from pipelines.live.model import Assessed, ModelInfo, TerrainModel
     from terrain.control.slip_table import SlipTable
-    from terrain.records import RunLog, Windows
+    from terrain.records import Array, RunLog, Windows
     from terrain.robots import Robot
 
 EXAMPLE = "terrain predict --data runs/ --model models:/field@champion --out predicted.csv"
@@ -205,6 +205,7 @@ def predict(
     ConfigError
         if the table is for another robot than a run is of.
     """
+    from pipelines.live.model import assess
     from pipelines.live.windows import needs_filter, windows_of_log
     from terrain.logs.run_folders import data_digest
 
@@ -214,7 +215,11 @@ def predict(
                 f"table {table.name} is for robot {table.robot!r}, run {each.run_id} is of {each.robot!r}"
             )
     cuts = [windows_of_log(each, model.info, robot, skip_short=skip_short) for each in runs]
-    rows = [row for cut in cuts for row in _predict_windows(cut.windows, model, table)]
+    parts = [cut.windows for cut in cuts if len(cut.windows)]
+    assessed = [assess(model, part) for part in parts]
+    over_time = _filtered(parts, assessed, model.info)
+    outputs = zip(parts, assessed, over_time, strict=True)
+    rows = [row for of_run in outputs for row in _predict_windows(*of_run, model, table)]
     classes = model.info.classes
     judged = [row for row in rows if row.label in classes]
     unknown = Counter(sorted(row.label for row in rows if row.label and row.label not in classes))
@@ -248,22 +253,39 @@ def predict(
     )
 
 
-def _predict_windows(windows: Windows, model: TerrainModel, table: SlipTable) -> list[WindowPrediction]:
+def _filtered(parts: Sequence[Windows], assessed: Sequence[Assessed], info: ModelInfo) -> list[Array]:
+    """Return the column of the class that is reported over time in each window of runs; -1 for unknown."""
+    import numpy as np
+
+    from pipelines.live.windows import filter_of
+    from terrain.classify.terrain_filter import filter_sessions, novelty_evidence, reported
+
+    settings = filter_of(info)
+    if settings is None or not parts:
+        return [np.where(each.unknown, -1, each.probability.argmax(axis=1)) for each in assessed]
+    probability, end_s, groups, evidence = (
+        np.concatenate(of_parts)
+        for of_parts in (
+            [each.probability for each in assessed],
+            [part.start_s + part.length_s for part in parts],
+            [part.groups for part in parts],
+            [novelty_evidence(each.novelty, each.unknown) for each in assessed],
+        )
+    )
+    belief = filter_sessions(probability, end_s, groups, info.window_s, settings, evidence)
+    return np.split(reported(belief), np.cumsum([len(part) for part in parts])[:-1])
+
+
+def _predict_windows(
+    windows: Windows, assessed: Assessed, over_time: Array, model: TerrainModel, table: SlipTable
+) -> list[WindowPrediction]:
     """Return the prediction of each window of a run; an unknown one has no terrain, and the table's fallback."""
     import numpy as np
 
-    from pipelines.live.model import assess, class_sets
-    from pipelines.live.windows import prior_of
-    from terrain.classify.terrain_filter import filter_run, novelty_evidence, reported
+    from pipelines.live.model import class_sets
     from terrain.control.switching import UNKNOWN
 
-    if not len(windows):
-        return []
-    assessed, prior = assess(model, windows), prior_of(model.info)
     best, sets = assessed.probability.argmax(axis=1), class_sets(model, assessed.probability)
-    evidence = novelty_evidence(assessed.novelty, assessed.unknown)
-    end_s = windows.start_s + windows.length_s
-    over_time = reported(filter_run(assessed.probability, end_s, prior, evidence))
     rows = []
     for i in range(len(windows)):
         nearest = model.info.classes[best[i]]

@@ -19,6 +19,7 @@ from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain.classify.limits import Motion, conformal_threshold, held_out_scores, learn_novelty, learn_support
+from terrain.classify.terrain_filter import choose_settings
 from terrain.errors import DataError
 from terrain.logs.run_folders import data_digest
 from terrain.logs.schema import ESTIMATED
@@ -143,10 +144,23 @@ def with_limits(
         conformal = conformal_threshold(held_out_scores(recipe[-1], terrain), samples.unit)
     except (AttributeError, DataError) as error:
         notes.append(f"no sets of terrains: {error}")
+    windows = samples.windows
+    end_s = windows.start_s + windows.length_s
+    over_time = choose_settings(
+        recipe[-1], terrain, end_s, windows.groups, windows.length_s, info.class_ratio
+    )
+    if over_time is None:
+        notes.append("no terrain is filtered over time: on held-out runs single windows are right more often")
+    info = replace(
+        info,
+        conformal=conformal,
+        share_power=None if over_time is None else over_time.share_power,
+        novelty_weight=info.novelty_weight if over_time is None else over_time.novelty_weight,
+    )
     if motion is not None:
         driven = motion.speed_mps, motion.yaw_rate_radps
         support = learn_support(*driven, terrain, samples.run_id, np.unique(terrain).tolist())
-    return TerrainModel(recipe, replace(info, conformal=conformal), novelty, support), tuple(notes)
+    return TerrainModel(recipe, info, novelty, support), tuple(notes)
 
 
 def fitted_model(

@@ -129,6 +129,7 @@ class Classifier(TerrainSource):
         self._waiting: deque[tuple[Mapping[str, Reading], Sequence[Estimate]] | _Part] = deque()
         self._finished: deque[WindowOutput] = deque()
         self._part: _Part | None = None  # that is worked with
+        self._over_time: LiveTerrainFilter | None = None
         self._due_s = math.inf
         self._counts: Mapping[str, int] = {}
         self._lost: Counter[str] = Counter()
@@ -163,9 +164,13 @@ class Classifier(TerrainSource):
             self._begin(model, self._feed_for(model))
 
     def restart(self) -> None:
-        """Cut windows anew from the next sample on."""
+        """Cut windows anew from the next sample on; the belief of the terrain filter goes on."""
         if self.model is not None:
+            over_time = self._over_time
             self._begin(self.model, self._feed_of(self.model))
+            if over_time is not None:
+                over_time.restart(self.model.info.window_s)
+                self._over_time = over_time
 
     def _feed_for(self, model: TerrainModel) -> WindowFeed:
         """Return what cuts the windows of another model: what cuts them now, where both take the same windows."""

@@ -18,6 +18,7 @@ from features.motion import window_motion
 from features.windows import Layout, SteadyMotion, WindowRule
 from pipelines.report.results import described
 from terrain.classify.limits import SUPPORTED, Novelty, SupportTable, conformal_sets, supported_probability
+from terrain.classify.terrain_filter import NOVELTY_WEIGHTS, SHARE_POWERS, FilterSettings
 from terrain.records import Array, Windows
 
 
@@ -47,6 +48,13 @@ class ModelInfo:
     robots: tuple[str, ...] = described("robots whose runs it was trained on", default=())
     filter: str = described("filter whose estimates it uses; empty where it uses none", default="")
     conformal: float | None = described("threshold of the sets of terrains, None without", default=None)
+    share_power: float | None = described(
+        "power of the class ratios that the terrain filter divides by; None where single windows are better",
+        default=SHARE_POWERS[0],
+    )
+    novelty_weight: float = described(
+        "of the novelty's log-likelihood in the terrain filter", default=NOVELTY_WEIGHTS[0]
+    )
 
     @property
     def layout(self) -> Layout:
@@ -69,15 +77,15 @@ class TerrainModel(NamedTuple):
     """A fitted recipe, and how its training windows were cut.
 
     ``recipe`` has ``predict_proba(windows)``, ``classes_`` and ``matrix`` of features.  ``novelty`` and ``support``
-    are None of training runs that give none; ``over_time`` is the filter of its outputs, where they are to be
-    filtered.
+    are None of training runs that give none; ``over_time`` are the settings of the filter of its outputs, where they
+    are to be filtered.
     """
 
     recipe: Any
     info: ModelInfo
     novelty: Novelty | None = None
     support: SupportTable | None = None
-    over_time: Array | None = None
+    over_time: FilterSettings | None = None
 
 
 class Assessed(NamedTuple):

@@ -19,7 +19,7 @@ from features.windows import (
     label_windows,
 )
 from pipelines.live.model import ModelInfo, TerrainModel
-from terrain.classify.terrain_filter import check_prior
+from terrain.classify.terrain_filter import FilterSettings, check_settings
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live import LIVE_FILTERS, Estimator, estimated_channels, make_live_filter
 from terrain.extension import correct_live
@@ -146,6 +146,7 @@ def windows_of_log(
     labelled = replace(
         windows,
         run_id=np.full(len(windows), run.run_id, dtype=object),
+        session=np.full(len(windows), run.session, dtype=object),
         terrain=label_windows(run, windows.start_s, windows.length_s),
     )
     reasons = {
@@ -156,16 +157,26 @@ def windows_of_log(
 
 def prior_of(info: ModelInfo) -> Array:
     """Return the shares (k,) of a model's classes in training, equal ones where it has none."""
-    return check_prior([float(info.class_ratio.get(name, 1.0 / len(info.classes))) for name in info.classes])
+    shares = [float(info.class_ratio.get(name, 1.0 / len(info.classes))) for name in info.classes]
+    return check_settings(shares).prior
+
+
+def filter_of(info: ModelInfo) -> FilterSettings | None:
+    """Return the settings of a model's terrain filter; None where single windows are better."""
+    if info.share_power is None:
+        return None
+    return check_settings(prior_of(info).tolist(), info.share_power, info.novelty_weight)
 
 
 def filtered(model: TerrainModel, stride_s: float | None = STRIDE_S) -> TerrainModel:
     """Return a model whose windows begin every ``stride_s`` and are filtered; the model itself for None.
 
+    One whose single windows are better than filtered ones is not filtered.
+
     Raises
     ------
     ConfigError
-        if the stride is not above zero, or longer than a window.
+        if the stride is not above zero, or longer than a window, or a setting of the filter is not accepted.
     """
     if stride_s is None:
         return model
@@ -175,4 +186,4 @@ def filtered(model: TerrainModel, stride_s: float | None = STRIDE_S) -> TerrainM
             "is required"
         )
     info = replace(model.info, stride_s=stride_s)
-    return model._replace(info=info, over_time=prior_of(model.info))
+    return model._replace(info=info, over_time=filter_of(model.info))

@@ -7,30 +7,36 @@ Hidden Markov model with k classes and the state "unknown", in continuous time. 
 
     \text{transition:}\quad & \bar b = e^{-r\,\Delta t}\, b + (1 - e^{-r\,\Delta t})\, \pi \\
     \text{emission:}\quad & b_c \propto \bar b_c\, \ell_c^{\lambda}, \qquad
-    \ell_c = (1 - \varepsilon)\, p_c / q_c + \varepsilon, \qquad \ell_\text{unknown} = \nu \\
+    \ell_c = (1 - \varepsilon)\, k\, p_c / (k\, q_c)^\alpha + \varepsilon, \qquad \ell_\text{unknown} = \nu^w \\
     \text{evidence:}\quad & \lambda = \min(\Delta t_\text{output} / T, 1)
 
 - A ground holds for a mean dwell D; then the next one is drawn from :math:`\pi`, uniform over the classes
   beside a small share of "unknown".  As a draw may repeat the ground, :math:`r = 1 / (D (1 - \pi_c))`.  Two
   steps are one long step exactly, so that a gap in time or a refused window is a longer transition and no
   special case.
-- A classifier gives the posterior p under the class shares q of its training; the likelihood is p / q up to a
-  factor (Bourlard and Morgan 1994, chapter 7), which a share :math:`\varepsilon` of windows that follow no
-  model bounds.  Of an unknown ground, windows are as frequent as of all grounds together: likelihood 1, or
-  :math:`\nu` where a score of novelty is given.
+- A classifier gives the posterior p under the class shares q of its training; were q wholly in it, the likelihood
+  would be p / q up to a factor (Bourlard and Morgan 1994, chapter 7).  A classifier that is tuned for accuracy holds
+  less of them: :math:`\alpha` = 1 divides by the shares, 0 does not.  A share :math:`\varepsilon` of windows that
+  follow no model bounds the likelihood.  Of an unknown ground, windows are as frequent as of all grounds together:
+  likelihood 1, or :math:`\nu^w` where a score of novelty is given; as a run is novel as a whole, its windows repeat
+  each other, and a weight w below 1 counts them for less.  :func:`choose_settings` chooses both on held-out windows.
 - Windows that overlap repeat each other: one that comes :math:`\Delta t_\text{output}` after the last adds
   that part of a window's evidence, to the power :math:`\lambda` (Gruenwald and van Ommen 2017 call it the
   learning rate).  Below T, any stride gives the same evidence per second.
+- Belief goes on from run to run of a session.  What was driven between two runs is not known; if it is like what was
+  recorded, it lasts as long as a run, so that the transition is over the duration of the run before.  After a command
+  of 6 s belief is widened by a third, after a recording of a minute little of it is left.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from terrain.classify.folds import units_of
 from terrain.errors import ConfigError, DataError
 from terrain.records import Array
 
@@ -55,6 +61,27 @@ DETECTED_RATIO = 0.2
 KNOWN_FLAGGED_RATIO = 0.05
 
 
+#: Powers of the shares and weights of novelty, what is preferred first: the square root lies between what a posterior
+#: that holds the shares and one that holds none of them need, and unknown ground is found by novelty alone.
+SHARE_POWERS, NOVELTY_WEIGHTS = (0.5, 0.25, 0.75, 0.0, 1.0), (1.0, 0.5, 0.0)
+#: Standard errors by which an accuracy has to be lower to be distinguished
+DISTINCT = 2.0
+
+
+class FilterSettings(NamedTuple):
+    """What the outputs of a classifier are as evidence."""
+
+    prior: Array  #: (k,) share of each class among the training windows
+    share_power: float = SHARE_POWERS[0]  #: power of these shares by which outputs are divided, 0 to 1
+    novelty_weight: float = NOVELTY_WEIGHTS[0]  #: of the log-likelihood of novelty, 0 to 1
+
+    def likelihood(self, probability: Array) -> Array:
+        """Return the likelihood (k,) of each class, against that of all grounds together, by an output (k,)."""
+        k = len(self.prior)
+        divided = k * np.asarray(probability) / (k * self.prior) ** self.share_power
+        return np.asarray((1.0 - OUTLIER_RATIO) * divided + OUTLIER_RATIO)
+
+
 class FilterBelief(NamedTuple):
     """Probability of each state (k + 1,), "unknown" last, and the time since the last output in s."""
 
@@ -62,8 +89,12 @@ class FilterBelief(NamedTuple):
     silent_s: float = math.inf
 
 
-def check_prior(prior: Sequence[float]) -> Array:
-    """Return the shares (k,) of the classes; ``ConfigError`` where they are fewer than two, or not within 0 and 1."""
+def check_settings(
+    prior: Sequence[float],
+    share_power: float = SHARE_POWERS[0],
+    novelty_weight: float = NOVELTY_WEIGHTS[0],
+) -> FilterSettings:
+    """Return settings; ``ConfigError`` where there are fewer than two classes, or a number is not within 0 and 1."""
     if len(prior) < 2:
         raise ConfigError(f"terrain filter: {len(prior)} classes, at least 2 are required")
     for number, share in enumerate(prior, start=1):
@@ -71,7 +102,10 @@ def check_prior(prior: Sequence[float]) -> Array:
             raise ConfigError(
                 f"terrain filter: prior of class {number} is {share!r}, a number between 0 and 1 is required"
             )
-    return np.array(prior, dtype=float)
+    for name, value in (("share power", share_power), ("novelty weight", novelty_weight)):
+        if not 0.0 <= value <= 1.0:
+            raise ConfigError(f"terrain filter: {name} is {value!r}, a number from 0 to 1 is required")
+    return FilterSettings(np.array(prior, dtype=float), share_power, novelty_weight)
 
 
 def grounds_of(n_classes: int) -> Array:
@@ -80,34 +114,35 @@ def grounds_of(n_classes: int) -> Array:
 
 
 def filter_step(
-    belief: FilterBelief, probability: Array, dt_s: float, prior: Array, novelty: float = 0.0
+    belief: FilterBelief, probability: Array, dt_s: float, settings: FilterSettings, novelty: float = 0.0
 ) -> FilterBelief:
     """Return the belief after a time, and one output of the classifier: probabilities (k,), NaN where there is none.
 
-    ``prior`` (k,) has the share of each class among the training windows, ``novelty`` is the log-likelihood of
-    "unknown" against that of all known grounds together.
+    ``novelty`` is the log-likelihood of "unknown" against that of all known grounds together.
     """
-    grounds = grounds_of(len(prior))
+    grounds = grounds_of(len(settings.prior))
     stays = math.exp(-dt_s / (DWELL_S * (1.0 - grounds[0])))
     now = stays * belief.probability + (1.0 - stays) * grounds
     silent_s = belief.silent_s + dt_s
     if not np.isfinite(probability).all():
         return FilterBelief(now, silent_s)
     power = min(silent_s / EVIDENCE_S, 1.0)
-    now[:-1] *= ((1.0 - OUTLIER_RATIO) * np.asarray(probability) / prior + OUTLIER_RATIO) ** power
+    now[:-1] *= settings.likelihood(probability) ** power
     if math.isfinite(novelty):
-        now[-1] *= math.exp(power * novelty)
+        now[-1] *= math.exp(power * settings.novelty_weight * novelty)
     return FilterBelief(now / now.sum(), 0.0)
 
 
-def filter_run(probability: Array, time_s: Array, prior: Array, novelty: Array | None = None) -> Array:
+def filter_run(
+    probability: Array, time_s: Array, settings: FilterSettings, novelty: Array | None = None
+) -> Array:
     """Return the belief (n, k + 1) after each of the windows of a run; it knows nothing of later ones.
 
     Parameters
     ----------
     probability : (n, k) class probabilities; rows of NaN where the classifier refused a window
     time_s : (n,) end of each window, not decreasing
-    prior : (k,) share of each class among the training windows
+    settings : what these are as evidence
     novelty : (n,) log-likelihood of "unknown" against that of all known grounds together; 0 by default
 
     Raises
@@ -118,13 +153,14 @@ def filter_run(probability: Array, time_s: Array, prior: Array, novelty: Array |
     Examples
     --------
     >>> probability = np.repeat([[0.9, 0.1], [0.1, 0.9]], 24, axis=0)
-    >>> belief = filter_run(probability, np.arange(48) / 4, np.array([0.5, 0.5]))
+    >>> belief = filter_run(probability, np.arange(48) / 4, check_settings((0.5, 0.5)))
     >>> float((reported(belief[24:]) == 1).argmax() / 4)  # s from the change to where it is reported
     0.75
     """
     rows, time_s = np.asarray(probability, dtype=np.float64), np.asarray(time_s, dtype=np.float64)
-    if rows.shape != (len(time_s), len(prior)):
-        needed = f"({len(time_s)}, {len(prior)})"
+    k = len(settings.prior)
+    if rows.shape != (len(time_s), k):
+        needed = f"({len(time_s)}, {k})"
         raise DataError(f"class probabilities have the shape {rows.shape}, {needed} is needed")
     scores = np.zeros(len(rows)) if novelty is None else np.asarray(novelty, dtype=np.float64)
     if scores.shape != time_s.shape:
@@ -132,11 +168,55 @@ def filter_run(probability: Array, time_s: Array, prior: Array, novelty: Array |
     dt_s = np.diff(time_s, prepend=time_s[:1])
     if not (dt_s >= 0.0).all():
         raise DataError("the windows of a run must be in order of time")
-    belief, out = FilterBelief(grounds_of(len(prior))), np.empty((len(rows), len(prior) + 1))
+    belief, out = FilterBelief(grounds_of(k)), np.empty((len(rows), k + 1))
     for i, (row, step_s, score) in enumerate(zip(rows, dt_s.tolist(), scores.tolist(), strict=True)):
-        belief = filter_step(belief, row, step_s, prior, score)
+        belief = filter_step(belief, row, step_s, settings, score)
         out[i] = belief.probability
     return out
+
+
+def session_time(end_s: Array, run: Array, length_s: float) -> Array:
+    """Return the ends (n,) of the windows of a session on one clock: runs (n,) follow each other, with time between.
+
+    Examples
+    --------
+    >>> session_time(np.array([2.0, 4.0, 2.0, 4.0]), np.array(["a", "a", "b", "b"]), 2.0).tolist()
+    [2.0, 4.0, 10.0, 12.0]
+    """
+    time_s, begin_s = np.array(end_s, dtype=float), None
+    for rows in np.split(np.arange(len(run)), np.flatnonzero(run[1:] != run[:-1]) + 1):
+        first_s, last_s = time_s[rows[[0, -1]]]
+        time_s[rows] += 0.0 if begin_s is None else begin_s - (first_s - length_s)
+        begin_s = time_s[rows[-1]] + (last_s - first_s + length_s)
+    return time_s
+
+
+def filter_sessions(
+    probability: Array,
+    end_s: Array,
+    groups: Array,
+    length_s: float,
+    settings: FilterSettings,
+    novelty: Array | None = None,
+) -> Array:
+    """Return the belief (n, k + 1) after each of the windows of runs: it goes on through a session.
+
+    Parameters
+    ----------
+    probability, settings, novelty : as of :func:`filter_run`
+    end_s, length_s : (n,) end of each window on the clock of its run, and their length
+    groups : (n, 2) session and run of each; runs of a session in the order in which they were driven
+    """
+    belief = np.empty((len(end_s), len(settings.prior) + 1))
+    (_, session), (runs, run) = (np.unique(each, return_inverse=True) for each in np.transpose(groups))
+    appears = np.full(len(runs), len(run))
+    np.minimum.at(appears, run, np.arange(len(run)))
+    order = np.lexsort((end_s, appears[run], session))
+    for rows in np.split(order, np.flatnonzero(np.diff(session[order])) + 1):
+        time_s = session_time(end_s[rows], run[rows], length_s)
+        scores = None if novelty is None else novelty[rows]
+        belief[rows] = filter_run(probability[rows], time_s, settings, scores)
+    return belief
 
 
 def reported(belief: Array) -> Array:
@@ -153,20 +233,79 @@ def novelty_evidence(novelty: Array, unknown: Array) -> Array:
     return np.asarray(np.where(np.isnan(novelty) & ~unknown, 0.0, np.where(unknown, flagged, passed)))
 
 
+def choose_settings(
+    classifier: Any,
+    terrain: Array,
+    end_s: Array,
+    groups: Array,
+    length_s: float,
+    prior: Mapping[str, float],
+    novelty: Array | None = None,
+) -> FilterSettings | None:
+    """Return the settings under which the filter is right most often; None where single windows are.
+
+    Of those that are no worse than single windows and cannot be distinguished from the best one, the first in the order
+    of :data:`SHARE_POWERS` and :data:`NOVELTY_WEIGHTS`: a mean difference over sessions, or runs where no class has
+    several sessions, is distinguished beyond :data:`DISTINCT` standard errors.  "unknown" counts as wrong.
+
+    Parameters
+    ----------
+    classifier : fitted on n windows; where it has no ``inner_probability_`` of them when their runs or sessions were
+        held out, the settings are those that are preferred
+    terrain : (n,) class of each window
+    end_s, groups, length_s, novelty : as of :func:`filter_sessions`
+    prior : share of each class among the training windows, in order
+    """
+    classes, shares = np.array([*prior]), check_settings([*prior.values()]).prior
+    truth, probability = np.searchsorted(classes, terrain), np.zeros((len(terrain), len(classes)))
+    held_out = getattr(classifier, "inner_probability_", math.nan)
+    probability[:, np.searchsorted(classes, classifier.classes_)] = held_out
+    there = np.isfinite(probability).all(axis=1)
+    weights = NOVELTY_WEIGHTS[:1] if novelty is None else NOVELTY_WEIGHTS
+    choices = [FilterSettings(shares, power, weight) for weight in weights for power in SHARE_POWERS]
+    if not there.any():
+        return choices[0]
+    right = np.empty((len(choices), there.sum()))
+    for i, settings in enumerate(choices):
+        belief = filter_sessions(probability, end_s, groups, length_s, settings, novelty)
+        right[i] = (reported(belief) == truth)[there]
+    single = np.mean(probability[there].argmax(axis=1) == truth[there])
+    accuracy = right.mean(axis=1)
+    unit = units_of(truth, groups)[there]
+    behind = right[accuracy.argmax()] - right
+    errors = np.array([_standard_error(each, unit) for each in behind])
+    among = np.flatnonzero((accuracy >= single) & (behind.mean(axis=1) <= DISTINCT * errors))
+    return choices[among[0]] if len(among) else None
+
+
+def _standard_error(values: Array, unit: Array) -> float:
+    """Return the standard error of the mean of values (n,) that are independent from unit to unit (n,) only."""
+    _, place = np.unique(unit, return_inverse=True)
+    sums = np.bincount(place, values - values.mean())
+    n = len(sums)
+    return math.sqrt(n / (n - 1) * float(np.square(sums).sum())) / len(values) if n > 1 else math.inf
+
+
 class LiveTerrainFilter:
     """The filter from one output of the classifier to the next, as they come.
 
     Examples
     --------
-    >>> live = LiveTerrainFilter(np.array([0.5, 0.5]))
+    >>> live = LiveTerrainFilter(check_settings((0.5, 0.5)))
     >>> for end_s in (2.0, 2.25, 2.5, 2.75):
     ...     best, probability = live.take(end_s, np.array([0.9, 0.1]))
     >>> best, round(probability, 2)
     (0, 0.97)
     """
 
-    def __init__(self, prior: Array) -> None:
-        self._prior, self._belief = prior, FilterBelief(grounds_of(len(prior)))
+    def __init__(self, settings: FilterSettings) -> None:
+        self._settings, self._belief = settings, FilterBelief(grounds_of(len(settings.prior)))
+        self._end_s = math.nan
+
+    def restart(self, gap_s: float) -> None:
+        """Go on, after a time without windows, with windows on another clock: belief stays, and is widened."""
+        nothing = np.full(len(self._settings.prior), math.nan)
+        self._belief = filter_step(self._belief, nothing, gap_s, self._settings)
         self._end_s = math.nan
 
     def take(
@@ -181,7 +320,7 @@ class LiveTerrainFilter:
         if dt_s > 0.0 or math.isnan(self._end_s):
             self._end_s = end_s
             evidence = float(novelty_evidence(np.array([novelty]), np.array([unknown]))[0])
-            self._belief = filter_step(self._belief, probability, dt_s, self._prior, evidence)
+            self._belief = filter_step(self._belief, probability, dt_s, self._settings, evidence)
         belief = self._belief.probability
         best = int(reported(belief[None])[0])
         return best, float(belief[best]) if best >= 0 else math.nan

@@ -154,8 +154,29 @@ def test_the_filtered_terrain_is_that_of_the_run_so_far(model, giving, drive):
     flat = np.tile([info.class_ratio[name] for name in info.classes], (12, 1))
     for outputs, expected in ((certain, info.classes[1]), (flat, None)):
         planned = giving(lambda windows, outputs=outputs: outputs[: len(windows)])
+        planned = planned._replace(info=replace(info, share_power=1.0))
         found = predict([log, replace(log, run_id="b")], planned, TABLE).windows
         assert [row.filtered_terrain for row in found] == [expected] * 24
+
+
+def test_belief_goes_on_through_a_session_and_without_a_filter_single_windows_are_reported(
+    model, giving, drive
+):
+    log = drive("a", "GRASS", 21, duration_s=4.0)
+
+    def outputs(windows):
+        return np.array([[0.6, 0.2, 0.2] if windows.run_id[0] == "b" else [0.05, 0.9, 0.05]] * len(windows))
+
+    planned, (first, second, _) = giving(outputs), model.info.classes
+    for session, power, expected in (
+        ("monday", 0.5, second),
+        ("", 0.5, first),
+        ("monday", None, first),
+    ):
+        info = replace(model.info, share_power=power)
+        runs = [replace(log, run_id=name, session=session) for name in ("a", "b")]
+        found = predict(runs, planned._replace(info=info), TABLE).windows
+        assert [row.filtered_terrain for row in found][:3] == [second, second, expected]
 
 
 @pytest.mark.parametrize(("ending", "read"), [(".csv", pandas.read_csv), (".parquet", pandas.read_parquet)])

@@ -12,6 +12,7 @@ import pytest
 
 from features.windows import cut_windows
 from pipelines.live.classifying import AT_MOST, MAX_WAITING, Classifier, WindowOutput, classify_window
+from terrain.classify.terrain_filter import check_settings
 from terrain.estimation.live import LiveFilter
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.replay import replay
@@ -135,6 +136,18 @@ def test_taking_waits_for_nothing_and_each_robot_gets_its_outputs_in_order(gate)
     assert starts(other, 1) == [100.0]
     assert starts(busy, 40) == [2.0 * k for k in range(40)]
     assert busy.dropped == {}
+
+
+def test_the_belief_of_the_terrain_filter_goes_on_where_windows_begin_anew(gate):
+    """As where the clock was set: the first window after it is not taken alone."""
+    model = stub_model("m")
+    model.over_time, model.info.window_s = check_settings((0.5, 0.5)), 2.0
+    robot, fresh = Classifier(model, None), Classifier(model, None)
+    for k in range(8):
+        robot._over_time.take(100.0 + k / 4, np.array([0.9, 0.1]))
+    robot.restart()
+    assert robot._over_time.take(2.0, np.array([0.45, 0.55]))[0] == 0
+    assert fresh._over_time.take(2.0, np.array([0.45, 0.55]))[0] == 1
 
 
 def test_of_too_many_steps_the_oldest_are_left_out_and_counted(gate):
