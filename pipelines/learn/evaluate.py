@@ -34,17 +34,21 @@ from terrain.classify.held_out import (
     fit_fold,
     itself,
     left_out_folds,
+    refused_rows,
     score_fold,
 )
 from terrain.classify.limits import Motion
 from terrain.classify.metrics import (
+    RefusalFigures,
     held_out_figures,
     learning_curve,
+    refusal_figures,
     sequence_figures,
     set_figures,
     unknown_figures,
 )
 from terrain.classify.svm import GroupedSVC
+from terrain.errors import DataError
 from terrain.records import Array
 
 CHECKED_WITH = FEATURE_RECIPE
@@ -153,6 +157,11 @@ def evaluate_recipe(
         shared = checked, terrain, group, gap, seed
         scores = [*parallel(score_fold, shared, left_out, settings.jobs, protocol, progress)]
         found |= unknown_figures(scores, terrain, group, windows.start_s, seed)
+    elif not published and (settings.extras or channels):
+        try:
+            found["refusals"] = _refusals(recipe, features, samples, held_out, settings, progress)
+        except DataError as error:
+            notes.append(f"no window is ever called unknown: {error}")
     if not published:
         found["conformal"] = set_figures(held_out, windows, samples.unit, seed)
         if motion is None:
@@ -204,6 +213,32 @@ def _of_svm(
         recipe = recipe_of(settings, CHECKED_WITH)
         features = feature_matrix(recipe, samples.windows)
     return recipe[-1], features
+
+
+def _refusals(
+    recipe: WindowPipeline,
+    features: Array,
+    samples: Samples,
+    held_out: HeldOut,
+    settings: EvaluationSettings | RecipeSettings,
+    progress: Progress,
+) -> RefusalFigures:
+    """Return how often the windows that the first fold assignment holds out are called unknown."""
+    _, checked = _of_svm(recipe, features, samples, settings)
+    terrain, group, rows = samples.terrain, samples.group, np.flatnonzero(held_out.tested)
+    first = [each.fold for each in held_out.results if each.fold.repeat == 0]
+    shared, refused = (
+        (checked, terrain, group, samples.gap, settings.seed),
+        np.zeros(len(terrain), dtype=bool),
+    )
+    folds = [(fold.train, fold.test) for fold in first]
+    found = parallel(refused_rows, shared, folds, settings.jobs, "refusals", progress)
+    for fold, of_fold in zip(first, found, strict=True):
+        refused[fold.test] = of_fold
+    groups = samples.windows.groups
+    return refusal_figures(
+        refused[rows], held_out.correct[0, rows], terrain[rows], groups[rows], settings.seed
+    )
 
 
 def _extras(

@@ -25,6 +25,7 @@ from terrain.classify.metrics import (
     FoldFigures,
     LearningCurve,
     LeftOutTerrain,
+    RefusalFigures,
     ReliabilityBin,
     RunFigures,
     SequenceFigures,
@@ -111,6 +112,9 @@ class CrossvalResult(Result):
     supported: PartFigures | None = optional("the other predictions")
     supported_auc: float | None = optional("area from supported probability to correctness", "1")
     next_drives: tuple[NextDrive, ...] | None = optional("what to record next, best first")
+    refusals: RefusalFigures | None = optional(
+        "windows of learned terrains called unknown, and accuracy with them"
+    )
     conformal: ConformalFigures | None = optional("sets of terrains that hold the true one")
     dataset: str | None = optional("name of the data")
     data_digest: str | None = optional("digest of the runs")
@@ -171,6 +175,15 @@ def report(result: CrossvalResult) -> Report:
     decide: list[tuple[Any, ...]] = [("always the most frequent terrain", result.chance, PERCENT)]
     if curve is not None:
         decide += [*result.pairs("speed_only_accuracy"), ("number of runs", curve.statement)]
+    if (found := result.refusals) is not None:
+        refused, ends, worst = (
+            format_value(each, PERCENT) for each in (found.refused, found.refused_ci, found.worst_run)
+        )
+        decide += [
+            ("refused as unknown", f"{refused} ({ends}, {result.over}), worst run {worst}"),
+            ("right of those accepted", found.accuracy_accepted, PERCENT),
+            ("right and accepted, of all", found.right_and_accepted, PERCENT),
+        ]
     if result.auroc_unknown is not None:
         decide += result.pairs("auroc_unknown", "unknown_accepted")
     if drives:

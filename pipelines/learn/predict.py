@@ -126,6 +126,15 @@ class Predictions(Result):
     filtered: tuple[str, ...] = described("runs that the live chain filtered, as they had no estimates")
     filtered_accuracy: float | None = described("as the accuracy, of the terrain filtered over time", "1")
     n_unknown: int = described("windows that are like no terrain that was learned")
+    known_refused: tuple[float, float, float] | None = described(
+        "part of held-out windows of learned terrains that is called unknown, and its interval", "1"
+    )
+    accuracy_refusing: float | None = described(
+        "as the accuracy, what is called unknown counted as wrong", "1"
+    )
+    accuracy_accepted: float | None = described(
+        "as the accuracy, of windows that are not called unknown", "1"
+    )
     n_unsupported: int | None = described("windows that no training run supports; None where not counted")
     model: str | None = described("as it was asked for", optional=True)
     dataset: str | None = described("name of the data", optional=True)
@@ -222,6 +231,8 @@ def predict(
     rows = [row for of_run in outputs for row in _predict_windows(*of_run, model, table)]
     classes = model.info.classes
     judged = [row for row in rows if row.label in classes]
+    accepted = [row for row in judged if row.terrain == row.nearest]
+    right = sum(row.nearest == row.label for row in accepted)
     unknown = Counter(sorted(row.label for row in rows if row.label and row.label not in classes))
     return Predictions(
         windows=tuple(rows),
@@ -248,6 +259,9 @@ def predict(
             }
             for terrain, targets in ((terrain, table.lookup(terrain)) for terrain in classes)
         },
+        known_refused=model.info.known_refused,
+        accuracy_refusing=right / len(judged) if judged else None,
+        accuracy_accepted=right / len(accepted) if accepted else None,
         n_unknown=sum(row.terrain != row.nearest for row in rows),
         n_unsupported=None if model.support is None else sum(row.supported is False for row in rows),
     )
@@ -373,11 +387,19 @@ def _picture(stretches: Sequence[Sequence[WindowPrediction]]) -> Figure | None:
 def _notes(result: Predictions) -> list[Part]:
     without = {row.terrain for row in result.windows if row.slip_entry != row.terrain == row.nearest}
     unestimated = any("unestimated" in row.status.values() for row in result.windows)
-    accuracy = format_value(result.filtered_accuracy, PERCENT)
+    accuracy, answered, accepted = (
+        format_value(each, PERCENT)
+        for each in (result.filtered_accuracy, result.accuracy_refusing, result.accuracy_accepted)
+    )
+    refused = "an unmeasured part"
+    if result.known_refused is not None:
+        rate, low, high = result.known_refused
+        refused = f"{format_value(rate, PERCENT)} ({format_value((low, high), PERCENT)}, 95 %)"
     notes = {
         "of runs that the model was trained on the accuracy is no measure of its skill": result.training_runs,
-        f"{result.n_unknown} windows are like no terrain that was learned, as are 5 % of those of learned "
-        "ones: unknown, for which the table's fallback is used": result.n_unknown,
+        f"{result.n_unknown} of {result.n_windows} windows are like no terrain that was learned: unknown, for which "
+        f"the table's fallback is used; of held-out windows of learned ones {refused} are": result.n_unknown,
+        f"counting unknown as wrong, {answered} are right; of what is not unknown, {accepted}": result.n_judged,
         f"{result.n_unsupported} predictions are supported by no training run that drove like this": (
             result.n_unsupported
         ),

@@ -201,7 +201,14 @@ def train(
     evaluation = replace(
         evaluation, dataset=dataset, data_digest=data.digest, notes=(*evaluation.notes, *missing, *notes)
     )
-    info = replace(model.info, commit=code_commit(), run_accuracy=run_accuracies(data, evaluation))
+    refusals = evaluation.refusals
+    known = None if refusals is None else (refusals.refused, *refusals.refused_ci)
+    info = replace(
+        model.info,
+        commit=code_commit(),
+        run_accuracy=run_accuracies(data, evaluation),
+        known_refused=None if known is None or np.isnan(known).any() else known,
+    )
     record = TrainingRecord(
         params={name: getattr(evaluation, name) for name in PARAMS}
         | {"skip_short": settings.skip_short, "signal_sets": ",".join(settings.signal_sets)},

@@ -76,7 +76,7 @@ def divided_units(y: Array, groups: Array, n_parts: int) -> Array:
     >>> divided_units(np.array(["ice"] * 4), groups, 2).tolist()
     ['monday', 'monday', 'tuesday', 'tuesday']
     >>> divided_units(np.array(["ice", "mud", "ice", "ice"]), groups, 2).tolist()
-    ['monday', 'monday block 1', 'tuesday', 'tuesday']
+    ['monday', 'b block 1', 'tuesday', 'tuesday']
     """
     unit, run = units_of(y, groups), run_of(groups)
     divided = unit.astype(object)

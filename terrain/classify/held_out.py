@@ -205,6 +205,12 @@ def score_fold(
     return Scored(test, unknown, fitted.score(X[test]), fitted.score(X[unknown]), fitted.threshold)
 
 
+def refused_rows(X: Array, y: Array, group: Array, gap: int, seed: int, train: Array, test: Array) -> Array:
+    """Return whether each test row is called unknown, by a score of novelty that is fitted on training rows."""
+    fitted = learn_novelty(X[train], y[train], group[train], gap=gap, seed=seed)
+    return ~(fitted.score(X[test]) <= fitted.threshold)
+
+
 #: Slow and fast runs of a class that are compared: at least so many, of so much time.
 MIN_RUNS_A_SIDE, MIN_TIME_A_SIDE_S = 2, 60.0
 MIN_CLASSES = 3  #: Slow and fast runs are compared where at least so many classes have enough of both.

@@ -13,9 +13,10 @@ less like the training windows:
 Each term has its rank among the terms of held-out known windows, ``P = (n_above + 1) / (n + 1)``, and the
 score is ``-(log P_1 + log P_2 + log P_3)`` (Fisher 1932, combination of independent tests; the terms depend
 on each other, so that the score is compared with a threshold of held-out windows and not with a chi-square).
-The references are windows of known terrains whose runs took no part in fitting: inner folds of whole runs.  The
-threshold keeps a given part of these windows.  Nothing is weighted, so that nothing has to be learned from
-terrains that are left out.  The score needs no classifier, and stands beside any.
+The references are windows of known terrains whose sessions or runs took no part in fitting: inner folds.  The
+threshold keeps a given part of the windows of a new session or run, as that of the sets below does.  Nothing is
+weighted, so that nothing has to be learned from terrains that are left out.  The score needs no classifier, and
+stands beside any.
 
 **Support** of a prediction: how many training runs drove its terrain as the robot drives now.  A classifier that saw a
 terrain only at one speed, or only straight on, has not seen it in a curve.  A training run supports a terrain if it
@@ -37,8 +38,9 @@ recorded alike.  With R runs, q is the smallest score with
 F_r the empirical distribution of run r (Dunn, Wasserman, Ramdas 2022, Distribution-free prediction sets for
 two-layer hierarchical models, section 3.1, pooled distributions): all windows of a run weigh together as much
 as those of another.  Coverage holds on average over windows of a new run, not in each run.  The most probable
-class is always in the set, which can only raise the coverage.  With scores of inner folds in place of a
-single calibration part (cross-conformal, Vovk 2015) the level is not guaranteed, and is therefore measured.
+class is always in the set, which can only raise the coverage.  A session is a run here, where there are several.  With
+scores of inner folds in place of a single calibration part (cross-conformal, Vovk 2015), and with fewer than nine units
+for a level of 0.9, the level is not guaranteed, and is therefore measured.
 """
 
 from __future__ import annotations
@@ -52,7 +54,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from terrain.classify.folds import TOO_FEW, inner_splits, two_classes
+from terrain.classify.folds import TOO_FEW, inner_splits, two_classes, units_of
 from terrain.errors import DataError
 from terrain.records import Array
 
@@ -195,7 +197,8 @@ def learn_novelty(
     reference = np.sort(known, axis=0)
     if len(reference) > MAX_REFERENCE:
         reference = np.quantile(reference, np.linspace(0.0, 1.0, MAX_REFERENCE), axis=0)
-    threshold = float(np.quantile(fisher_scores(reference, known), KNOWN_KEPT))
+    unit = units_of(y, groups)[np.isfinite(terms).all(axis=1)]
+    threshold = conformal_threshold(fisher_scores(reference, known), unit, KNOWN_KEPT, np.inf)
     return _fitted(X, y)._replace(reference=reference, threshold=threshold)
 
 
@@ -375,26 +378,38 @@ def held_out_scores(classifier: Any, terrain: Array) -> Array:
     return np.asarray(1.0 - classifier.inner_probability_[np.arange(len(terrain)), truth])
 
 
-def conformal_threshold(scores: Array, runs: Array, level: float = LEVEL) -> float:
-    """Return q of held-out scores (n,), NaN left out; 1, every class in every set, where runs (n,) are too few.
+def conformal_threshold(scores: Array, units: Array, level: float = LEVEL, most: float = 1.0) -> float:
+    """Return q of held-out scores (n,), NaN left out, over their units (n,), sessions or runs.
 
-    ``DataError`` where no score is finite.
+    Where the units are too few for a guarantee, q is the smallest score up to which the mean of their distributions,
+    less its standard error, reaches the level; with one unit it is the most that a score can be.  ``DataError`` where
+    no score is finite.
 
     Examples
     --------
     >>> scores, runs = np.arange(100) / 100, np.arange(100).astype(str)
-    >>> conformal_threshold(scores, runs, 0.9), conformal_threshold(scores[:5], runs[:5], 0.9)
+    >>> conformal_threshold(scores, runs, 0.9), conformal_threshold(scores[:1], runs[:1], 0.9)
     (0.9, 1.0)
+    >>> conformal_threshold(np.array([0.1, 0.5, 0.2, 0.6]), np.array(["a", "a", "b", "b"]), 0.9)
+    0.6
     """
     kept = np.isfinite(scores)
     if not kept.any():
         raise DataError("there is no held-out window to calibrate the sets of classes with")
-    scores, runs = scores[kept], runs[kept]
-    _, run_of, n_windows = np.unique(runs.astype(str), return_inverse=True, return_counts=True)
-    order = np.argsort(scores, kind="stable")
-    weight = 1.0 / (n_windows[run_of] * (len(n_windows) + 1.0))
-    reached = np.cumsum(weight[order]) >= level - 1e-12
-    return float(scores[order][reached.argmax()]) if reached.any() else 1.0
+    scores, units = scores[kept], units[kept]
+    _, unit_of, n_windows = np.unique(units.astype(str), return_inverse=True, return_counts=True)
+    order, n_units = np.argsort(scores, kind="stable"), len(n_windows)
+    if (1.0 - level) * (
+        n_units + 1.0
+    ) >= 1.0 - 1e-9:  # one unit more, whose scores are all above, can be missed
+        held = np.cumsum(1.0 / (n_windows[unit_of[order]] * (n_units + 1.0)))
+    elif n_units > 1:
+        each = np.cumsum(unit_of[order, None] == np.arange(n_units), axis=0) / n_windows
+        held = each.mean(axis=1) - each.std(axis=1, ddof=1) / np.sqrt(n_units)
+    else:
+        return most
+    reached = held >= level - 1e-12
+    return float(scores[order][reached.argmax()]) if reached.any() else most
 
 
 def conformal_sets(probability: Array, threshold: float) -> Array:

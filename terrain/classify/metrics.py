@@ -376,6 +376,55 @@ def set_figures(held_out: HeldOut, windows: Windows, unit: Array, seed: int) -> 
     )
 
 
+MIN_RUN_WINDOWS = 5  #: A run of fewer windows is not the worst one: a single window would decide.
+
+
+class RefusalFigures(NamedTuple):
+    """How often windows of learned terrains are called unknown when held out, and the accuracy with and without.
+
+    Every ``_ci`` is of 95 % over units.
+    """
+
+    refused: float  #: part of the windows that are called unknown
+    refused_ci: Interval
+    worst_run: float  #: of the run with the most, among those of at least 5 windows; NaN without
+    accuracy_accepted: float  #: of the windows that are not called unknown
+    accuracy_accepted_ci: Interval
+    right_and_accepted: float  #: part of all windows that is answered, and right
+    right_and_accepted_ci: Interval
+    n_units: int
+
+
+def refusal_figures(
+    refused: Array, correct: Array, terrain: Array, groups: Array, seed: int
+) -> RefusalFigures:
+    """Return the figures of held-out windows (n,), whether each is called unknown, and whether its class is right.
+
+    Examples
+    --------
+    >>> refused, right = np.arange(40) % 10 == 0, np.arange(40) % 5 > 0
+    >>> found = refusal_figures(refused, right, np.repeat(["ice", "mud"], 20), np.repeat(list("abcd"), 10), 0)
+    >>> found.refused, round(found.accuracy_accepted, 2), found.right_and_accepted, found.worst_run
+    (0.1, 0.89, 0.8, 0.1)
+    """
+    unit, run, once = units_of(terrain, groups), run_of(groups), np.ones(len(terrain))
+    draws = Draws.of(unit, terrain, N_BOOTSTRAP, np.random.default_rng(seed))
+    parts = (refused * 1.0, ~refused * 1.0, correct * ~refused * 1.0, once)
+    n_refused, n_accepted, n_right, n_all = (
+        draws.weights @ np.bincount(draws.place, part, draws.weights.shape[1]) for part in parts
+    )
+    pairs = (n_refused, n_all), (n_right, n_accepted), (n_right, n_all)
+    figures = []
+    for numerator, denominator in pairs:
+        value, interval = draws.ratio(numerator, denominator)
+        figures.append((math.nan if value is None else value, interval or NO_INTERVAL))
+    _, run_number, size = np.unique(run, return_inverse=True, return_counts=True)
+    rates = (np.bincount(run_number, refused) / size)[size >= MIN_RUN_WINDOWS]
+    worst = float(rates.max()) if len(rates) else math.nan
+    of_refused, *of_right = figures
+    return RefusalFigures(*of_refused, worst, *of_right[0], *of_right[1], len(np.unique(unit)))
+
+
 N_PAIRED_DRAWS = 2000
 #: An interval of fewer degrees of freedom, the units less their classes, says nothing: it is not given.
 MIN_FREEDOM = 2
