@@ -54,6 +54,7 @@ class ModelInfo:
     )
     novelty_weight: float = described(
         "of the novelty's log-likelihood in the terrain filter", default=NOVELTY_WEIGHTS[0]
+    )
     known_refused: tuple[float, float, float] | None = described(
         "part of held-out windows of learned terrains that is called unknown, and its interval of 95 % over units; "
         "None where not measured",
