@@ -211,7 +211,8 @@ INTERVAL = Column("95 %, paired", POINTS, "points")
 def _points(found: Difference) -> tuple[float, tuple[float, float], str]:
     """Return a difference and its interval in percentage points, and its verdict."""
     low, high = found.interval
-    return 100 * found.difference, (100 * low, 100 * high), str(found.verdict)
+    reason = f": {found.reason}" if found.reason else ""
+    return 100 * found.difference, (100 * low, 100 * high), f"{found.verdict}{reason}"
 
 
 def _paired(found: Comparison) -> list[Part]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Self
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError, model_validator
 
-from pipelines.report.numbers import enumerated, plural
+from pipelines.report.numbers import enumerated, format_value, plural
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
@@ -20,11 +20,14 @@ from terrain.errors import ConfigError, DataError, LogError
 from terrain.files.names import plain_name
 
 if TYPE_CHECKING:
+    from pipelines.live.model import ModelInfo
     from terrain.classify.proposals import LabelSource, Proposal
     from terrain.logs.run_folders import DoubtfulWindow, RunWindows
     from terrain.records import Label, RunLog
 
 EXAMPLE = "terrain label runs/ --run GRASS_01 --from 2 --to 6 --terrain SNOW"
+
+PERCENT = ".1%"
 
 SOURCES_FILE = "label_sources.json"  #: Beside a run: where each of its labels comes from
 
@@ -45,7 +48,7 @@ class Settings(BaseSettings):
     proposals: Path = setting(Path("proposals.csv"), "Table of the proposals, to be answered.")
     answers: Path | None = setting(None, "Table with answers: a terrain, 'yes', or 'none'.")
     out: Path | None = setting(None, "New folder of the runs with their labels.")
-    accept: float = setting(0.9, "Confidence from which a proposal needs no answer.", ge=0.0, le=1.01)
+    error: float = setting(0.02, "Part of what is taken over unasked that may be wrong.", ge=0.0, le=1.0)
     new_class: bool = setting(False, "Accept answers with terrains that are not known yet.")
 
     @property
@@ -112,6 +115,7 @@ class ProposalsResult(Result):
     n_runs: int = described("number of runs")
     n_asked: int = described("number of questions")
     n_taken_over: int = described("proposals that need no answer")
+    taken_over: str = described("from which confidence, and what held-out runs show of it")
     proposals: tuple[Proposal, ...] = described("stretches with the terrain that the model proposes")
 
 
@@ -150,7 +154,7 @@ def _propose(settings: Settings, model_uri: str) -> ProposalsResult:
     from pipelines.learn.model_file import read_model
     from pipelines.live.model import assess
     from pipelines.live.windows import prior_of, windows_of_log
-    from terrain.classify.proposals import propose, questions
+    from terrain.classify.proposals import propose, questions, taken_from
     from terrain.files.atomic import atomic_write
 
     model, runs = read_model(model_uri), load_runs(settings.data)
@@ -166,11 +170,37 @@ def _propose(settings: Settings, model_uri: str) -> ProposalsResult:
         raise DataError(f"{settings.data}: no run holds a window that the model classifies")
     asked = questions(proposals, settings.ask)
     rest = [i for i in range(len(proposals)) if i not in set(asked)]
+    if (least := taken_from(model.info.taken_over, settings.error)) is not None:
+        for i in rest:
+            taken = proposals[i].terrain in least.terrains and proposals[i].certain(least.confidence)
+            proposals[i] = proposals[i]._replace(taken_over=taken)
     table = pd.DataFrame([proposals[i] for i in (*asked, *rest)])
     table["ask"], table["answer"] = [*range(1, len(asked) + 1), *("" for _ in rest)], ""
     atomic_write(settings.proposals, table.to_csv(index=False, float_format="%.6g"))
-    taken = sum(proposals[i].taken_over(settings.accept) for i in rest)
-    return ProposalsResult(settings.data, settings.proposals, len(runs), len(asked), taken, tuple(proposals))
+    n_taken, words = sum(each.taken_over for each in proposals), taken_over_words(model.info, settings.error)
+    counts = len(runs), len(asked), n_taken
+    return ProposalsResult(settings.data, settings.proposals, *counts, words, tuple(proposals))
+
+
+def taken_over_words(info: ModelInfo, error: float) -> str:
+    """Return in a sentence what a model takes over unasked, or why nothing."""
+    from terrain.classify.proposals import taken_from
+
+    if not info.taken_over:
+        return "No proposal is taken over unasked: the model held no run out that shows how many are wrong."
+    taken = taken_from(info.taken_over, error)
+    least = taken or min(info.taken_over, key=lambda each: each.wrong_upper)
+    shown = (
+        f"from a confidence of {least.confidence:g} {format_value(least.wrong, PERCENT)} of the time is wrong in "
+        f"{least.n_units} training runs or sessions when held out, at most {format_value(least.wrong_upper, PERCENT)} "
+        "with 95 %"
+    )
+    if taken is None:
+        return (
+            f"No proposal is taken over unasked, as more than {format_value(error, PERCENT)} (--error) may be wrong: "
+            f"{shown}; label more runs, or answer."
+        )
+    return f"Proposals are taken over unasked: {shown}."
 
 
 def _write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult:
@@ -190,7 +220,7 @@ def _write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult
     labels = {run.run_id: [LabelSource(*label, "measured", None) for label in run.labels] for run in runs}
     left_open = 0
     for proposal, answer in _checked_answers(answers, runs, new_class=settings.new_class):
-        added = label_of(proposal, answer, settings.accept)
+        added = label_of(proposal, answer)
         if added is None:
             left_open += not answer
         else:
@@ -198,8 +228,7 @@ def _write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult
     counts = Counter(each.source for of_run in labels.values() for each in of_run)
     if not set(counts) - {"measured"}:
         raise ConfigError(
-            f"{answers}: no answer, and no proposal of a confidence of {settings.accept:g}, adds a label: "
-            "nothing is written"
+            f"{answers}: no answer, and no proposal that is taken over, adds a label: nothing is written"
         )
     written = {run_id: tuple(sorted(of_run)) for run_id, of_run in labels.items()}
     with atomic_folder(out) as folder:
@@ -313,6 +342,7 @@ def _proposals_report(result: ProposalsResult) -> Report:
         f"{plural(result.n_asked, 'question')}; of the other {rest}, {result.n_taken_over} need no answer",
         parts=(
             *((table,) if asked else ()),
+            Text(result.taken_over),
             Text("answer with a terrain, 'yes' or 'none' in the column answer", kind="note"),
         ),
         next_step=f"terrain label {result.data} --answers {result.file} --out NEW",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain.classify.limits import Motion, conformal_threshold, held_out_scores, learn_novelty, learn_support
+from terrain.classify.proposals import TakenOver, held_out_errors
 from terrain.classify.terrain_filter import choose_settings
 from terrain.errors import DataError
 from terrain.logs.run_folders import data_digest
@@ -154,6 +155,7 @@ def with_limits(
     info = replace(
         info,
         conformal=conformal,
+        taken_over=_errors_taken_over(recipe[-1], info, samples),
         share_power=None if over_time is None else over_time.share_power,
         novelty_weight=info.novelty_weight if over_time is None else over_time.novelty_weight,
     )
@@ -161,6 +163,15 @@ def with_limits(
         driven = motion.speed_mps, motion.yaw_rate_radps
         support = learn_support(*driven, terrain, samples.run_id, np.unique(terrain).tolist())
     return TerrainModel(recipe, info, novelty, support), tuple(notes)
+
+
+def _errors_taken_over(classifier: Any, info: ModelInfo, samples: Samples) -> tuple[TakenOver, ...]:
+    """Return how wrong proposals of labels are on held-out runs; nothing of a classifier that held none out."""
+    held_out = getattr(classifier, "inner_probability_", None)
+    if held_out is None:
+        return ()
+    prior = np.array([info.class_ratio[name] for name in info.classes])
+    return held_out_errors(samples.windows, held_out, info.classes, prior, samples.unit)
 
 
 def fitted_model(

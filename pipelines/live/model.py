@@ -18,6 +18,7 @@ from features.motion import window_motion
 from features.windows import Layout, SteadyMotion, WindowRule
 from pipelines.report.results import described
 from terrain.classify.limits import SUPPORTED, Novelty, SupportTable, conformal_sets, supported_probability
+from terrain.classify.proposals import TakenOver
 from terrain.classify.terrain_filter import NOVELTY_WEIGHTS, SHARE_POWERS, FilterSettings
 from terrain.records import Array, Windows
 
@@ -61,6 +62,7 @@ class ModelInfo:
         "1",
         default=None,
     )
+    taken_over: tuple[TakenOver, ...] = described("wrong proposals of labels for held-out runs", default=())
 
     @property
     def layout(self) -> Layout:

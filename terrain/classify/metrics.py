@@ -464,7 +464,8 @@ class Outcome(NamedTuple):
 class Difference(NamedTuple):
     """A figure of two classifiers; ``difference`` is b minus a, with its ``interval`` of 95 % over units.
 
-    The interval is NaN where there are too few units by class: less than :data:`MIN_FREEDOM` beyond one a class.
+    Only classes in which the two differ show how units differ.  The interval is NaN, and ``reason`` says so, where
+    these have too few units: less than :data:`MIN_FREEDOM` beyond one a class.
     """
 
     a: float
@@ -473,6 +474,7 @@ class Difference(NamedTuple):
     interval: Interval
     verdict: Verdict
     n_units: int
+    reason: str = ""
 
 
 class UnitDifference(NamedTuple):
@@ -558,11 +560,14 @@ def compare_outcomes(a: Outcome, b: Outcome, rng: np.random.Generator) -> Compar
         figures.append((by_part, macro, np.mean(areas, axis=0)))
         rates.append(rate.tolist())
     (parts_a, macro_a, area_a), (parts_b, macro_b, area_b) = figures
+    differs = np.not_equal(*rates)
     accuracy = {
-        name: _difference(parts_a[name], parts_b[name], terrain[kept > 0]) for name, kept in parts.items()
+        name: _difference(parts_a[name], parts_b[name], terrain[kept > 0], differs[kept > 0])
+        for name, kept in parts.items()
     }
     of_all = accuracy.pop("")
-    macro, area = (_difference(*each, terrain) for each in ((macro_a, macro_b), (area_a, area_b)))
+    macro = _difference(macro_a, macro_b, terrain, differs)
+    area = _difference(area_a, area_b, terrain, np.ones(len(cells), dtype=bool))
     by_unit = (UnitDifference(*cell, *pair) for cell, *pair in zip(cells, *rates, strict=True))
     return Comparison(of_all, macro, area, accuracy, tuple(by_unit))
 
@@ -574,19 +579,28 @@ def paired_accuracy(
     draws = Draws.of(unit, terrain, N_PAIRED_DRAWS, rng)
     weights = draws.weights[:, draws.place] * n_windows
     of_a, of_b = (weights @ each / weights.sum(axis=1) for each in (a, b))
-    return _difference(of_a, of_b, terrain[np.unique(draws.place, return_index=True)[1]])
+    differs = np.bincount(draws.place, a != b) > 0
+    return _difference(of_a, of_b, terrain[np.unique(draws.place, return_index=True)[1]], differs)
 
 
-def _difference(of_a: Array, of_b: Array, stratum: Array) -> Difference:
+def _difference(of_a: Array, of_b: Array, stratum: Array, differs: Array) -> Difference:
     """Return the difference of figures of which the first is of all units, the others of draws of them.
 
-    ``stratum`` (units,) has the class of each unit.
+    ``stratum`` (units,) has the class of each unit, ``differs`` (units,) whether the two differ on it.
     """
-    draws, freedom = of_b[1:] - of_a[1:], freedom_of(stratum)
-    low, high = percentile_interval(draws, freedom=freedom) if freedom >= MIN_FREEDOM else NO_INTERVAL
+    apart = of_b - of_a
+    matters = stratum[np.isin(stratum, stratum[differs])] if differs.any() else stratum
+    freedom, (low, high), reason = freedom_of(matters), NO_INTERVAL, ""
+    if freedom >= MIN_FREEDOM:
+        low, high = percentile_interval(apart[1:], freedom=freedom)
+    else:
+        counts = ", ".join(
+            f"{name} {n}" for name, n in zip(*np.unique(matters, return_counts=True), strict=True)
+        )
+        reason = f"too few runs or sessions where they differ ({counts})"
     verdict = Verdict.BETTER if low > 0 else Verdict.WORSE if high < 0 else Verdict.NOT_DISTINGUISHED
-    ends, apart = (low, high), float(of_b[0] - of_a[0])
-    return Difference(float(of_a[0]), float(of_b[0]), apart, ends, verdict, len(stratum))
+    ends = float(of_a[0]), float(of_b[0]), float(apart[0])
+    return Difference(*ends, (low, high), verdict, len(stratum), reason)
 
 
 MEAN_SPAN_S = 10.0  #: Novelty scores are averaged over so long: a robot crosses a terrain for longer.

@@ -28,11 +28,12 @@ from terrain.classify.folds import Fold
 from terrain.classify.held_out import Examples
 from terrain.classify.limits import SUPPORTED, Motion, learn_support, supported_probability
 from terrain.classify.metrics import Difference, Outcome, compare_outcomes
-from terrain.classify.proposals import ACCEPTED, Proposal, questions
+from terrain.classify.proposals import Proposal, questions
 from terrain.errors import DataError
 from terrain.records import Array
 
 EXAMPLE = "python tests/studies labels --data runs --repeats 5"
+CERTAIN = 0.9  #: Confidence from which self-training takes a run
 STRATEGIES = ("first run of each terrain", "random", "doubt", "random, self-trained", "doubt, self-trained")
 
 
@@ -137,7 +138,7 @@ def _fold_labels(
         n_taken = 0
         for run in rest:
             proposal = _proposal(model, examples, motion, rows, runs, run, known)
-            if proposal.taken_over(ACCEPTED):
+            if proposal.certain(CERTAIN):
                 terrain[runs == run], used[runs == run] = proposal.terrain, True
                 n_taken += 1
         found.append(_on(_fit(classifier, examples, rows, terrain, used), examples, fold.test))

@@ -107,15 +107,16 @@ def rows_of(file):
     return pd.read_csv(file, dtype=str, keep_default_na=False).to_dict("records")
 
 
-def answered(proposed, place, rows, accept=1.01, **options):
+def answered(proposed, place, rows, **options):
     """Take answers that are rows of a table, or a text."""
     table = place / "answers.csv"
     table.write_text(rows if isinstance(rows, str) else pd.DataFrame(rows).to_csv(index=False))
-    return label(Settings(data=proposed.data, answers=table, out=place / "out", accept=accept, **options))
+    return label(Settings(data=proposed.data, answers=table, out=place / "out", **options))
 
 
 def test_proposals_cover_the_runs_and_questions_come_first(proposed):
-    assert (proposed.n_runs, proposed.n_asked) == (4, 2)
+    assert (proposed.n_runs, proposed.n_asked, proposed.n_taken_over) == (4, 2, 0)
+    assert "No proposal is taken over unasked, as more than 2.0" in proposed.taken_over  # of so few runs
     right = sum(p.n_windows for p in proposed.proposals if p.run_id == f"new_{p.terrain}")
     assert right > 0.6 * sum(p.n_windows for p in proposed.proposals if p.run_id != "old")
     rows = rows_of(proposed.file)
@@ -145,7 +146,8 @@ def test_answers_stand_above_what_the_model_proposes_and_measured_labels_stay(pr
 
 
 def test_what_the_model_is_certain_of_needs_no_answer(proposed, tmp_path):
-    found = answered(proposed, tmp_path, rows_of(proposed.file), accept=0.0)
+    rows = [row | {"taken_over": str(not row["ask"])} for row in rows_of(proposed.file)]
+    found = answered(proposed, tmp_path, rows)
     of_model = [each for labels in found.runs.values() for each in labels if each.source == "model"]
     assert len(of_model) == found.n_labels["model"] >= 1
     assert all(0 < each.confidence <= 1 for each in of_model)

@@ -22,6 +22,7 @@ from terrain.classify.metrics import (
     enough_runs,
     held_out_figures,
     last_class,
+    paired_accuracy,
     sequence_figures,
     track_of,
     vote,
@@ -218,6 +219,26 @@ def test_a_classifier_does_not_differ_from_itself_and_the_sign_follows_the_order
     assert by_unit["7"] == pytest.approx(a.correct[:, a.unit == "7"].mean())
     per_class = [np.mean([row.b for row in found.by_unit if row.terrain == name]) for name in ("ice", "mud")]
     assert found.macro_run_accuracy.b == pytest.approx(np.mean(per_class))
+
+
+def test_a_difference_in_single_runs_of_classes_is_no_verdict_however_many_agree_elsewhere():
+    unit = np.repeat(np.arange(14).astype(str), 10)
+    terrain = np.repeat(["ice", "mud", *["sand"] * 12], 10)
+    right = np.ones((1, 140), dtype=bool)
+    wrong = right & ~np.isin(unit, ["0", "1"])
+    a, b = (Outcome(unit, terrain, each, np.full((1, 140), 0.9)) for each in (right, wrong))
+    found = compare_outcomes(a, b, np.random.default_rng(0))
+    for row in (found.accuracy, found.macro_run_accuracy, found.by_class["ice"]):
+        assert row.difference < 0.0
+        assert np.isnan(row.interval).all()
+        assert row.verdict is Verdict.NOT_DISTINGUISHED
+    assert found.accuracy.reason == "too few runs or sessions where they differ (ice 1, mud 1)"
+    assert found.by_class["sand"].interval == (0.0, 0.0)
+    runs = [np.arange(14).astype(str), terrain[::10], np.full(14, 10)]
+    paired = paired_accuracy(
+        *runs, *(each[0, ::10] * 1.0 for each in (right, wrong)), np.random.default_rng(0)
+    )
+    assert (paired.reason, paired.difference) == (found.accuracy.reason, found.accuracy.difference)
 
 
 def test_windows_may_differ_but_runs_may_not():
