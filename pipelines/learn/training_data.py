@@ -18,9 +18,17 @@ from pipelines.learn.model_file import model_info
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
 from pipelines.live.model import ModelInfo, TerrainModel
-from terrain.classify.limits import Motion, conformal_threshold, held_out_scores, learn_novelty, learn_support
+from terrain.classify.limits import (
+    Motion,
+    conformal_threshold,
+    fisher_scores,
+    held_out_scores,
+    held_out_terms,
+    learn_novelty,
+    learn_support,
+)
 from terrain.classify.proposals import TakenOver, held_out_errors
-from terrain.classify.terrain_filter import choose_settings
+from terrain.classify.terrain_filter import choose_settings, novelty_evidence
 from terrain.errors import DataError
 from terrain.logs.run_folders import data_digest
 from terrain.logs.schema import ESTIMATED
@@ -135,10 +143,13 @@ def with_limits(
     recipe, info : fitted on the windows, and what is known of it
     samples, features, motion : the windows, their features (n, f), and how the robot moved in each, if known
     """
-    notes, conformal, novelty, support = [], None, None, None
-    terrain = samples.terrain
+    notes, conformal, novelty, support, evidence = [], None, None, None, None
+    terrain, dealt = samples.terrain, {"gap": samples.gap, "seed": info.seed}
     try:
-        novelty = learn_novelty(features, terrain, samples.group, gap=samples.gap, seed=info.seed)
+        terms = held_out_terms(features, terrain, samples.group, **dealt)
+        novelty = learn_novelty(features, terrain, samples.group, **dealt, terms=terms)
+        score = fisher_scores(novelty.reference, terms)
+        evidence = novelty_evidence(score, score > novelty.threshold)
     except DataError as error:
         notes.append(f"no window is ever called unknown: {error}")
     try:
@@ -148,7 +159,7 @@ def with_limits(
     windows = samples.windows
     end_s = windows.start_s + windows.length_s
     over_time = choose_settings(
-        recipe[-1], terrain, end_s, windows.groups, windows.length_s, info.class_ratio
+        recipe[-1], terrain, end_s, windows.groups, windows.length_s, info.class_ratio, evidence
     )
     if over_time is None:
         notes.append("no terrain is filtered over time: on held-out runs single windows are right more often")

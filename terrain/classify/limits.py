@@ -166,13 +166,21 @@ def fisher_scores(reference: Array, terms: Array) -> Array:
     return score
 
 
+def held_out_terms(X: Array, y: Array, groups: Array, *, gap: int = 1, seed: int = 0) -> Array:
+    """Return the terms (n, 3) of training windows when their session or run was held out; NaN where it never was.
+
+    Arguments and errors are those of :func:`learn_novelty`.
+    """
+    X, y, groups = np.asarray(X, dtype=float), np.asarray(y), np.asarray(groups)
+    two_classes(y)
+    terms = np.full((len(y), N_TERMS), np.nan)
+    for train, test in inner_splits(y, groups, N_INNER_FOLDS, seed, gap):
+        terms[test] = _fitted(X[train], y[train]).terms(X[test])
+    return terms
+
+
 def learn_novelty(
-    X: Array,
-    y: Array,
-    groups: Array,
-    *,
-    gap: int = 1,
-    seed: int = 0,
+    X: Array, y: Array, groups: Array, *, gap: int = 1, seed: int = 0, terms: Array | None = None
 ) -> Novelty:
     """Return the score of novelty of training windows: features (n, f), NaN where not defined, classes and runs (n,).
 
@@ -180,17 +188,16 @@ def learn_novelty(
     ----------
     gap : rows left out beside a block, where the only run of a class is cut
     seed : deals runs into inner folds
+    terms : of :func:`held_out_terms`, where they are there already
 
     Raises
     ------
     DataError
         if there is one class only, or rows are too few to hold some of them out.
     """
-    X, y, groups = np.asarray(X, dtype=float), np.asarray(y), np.asarray(groups)
-    two_classes(y)
-    terms = np.full((len(y), N_TERMS), np.nan)
-    for train, test in inner_splits(y, groups, N_INNER_FOLDS, seed, gap):
-        terms[test] = _fitted(X[train], y[train]).terms(X[test])
+    if terms is None:
+        terms = held_out_terms(X, y, groups, gap=gap, seed=seed)
+    X, y = np.asarray(X, dtype=float), np.asarray(y)
     known = terms[np.isfinite(terms).all(axis=1)]
     if not len(known):
         raise DataError(TOO_FEW)

@@ -13,7 +13,11 @@ from features.recipes import feature_matrix, make_recipe
 from pipelines.learn.card import model_result
 from pipelines.learn.classifier import TerrainClassifier
 from pipelines.learn.crossval import cross_validate, crossval
+from pipelines.learn.settings import RecipeSettings
+from pipelines.learn.training_data import data_of_runs, info_of, with_limits
+from pipelines.live.windows import filter_of, filtered
 from terrain.classify.grouped import OwnClassifier
+from terrain.classify.terrain_filter import filter_sessions, reported
 from terrain.errors import ConfigError, DataError, ModelError
 
 
@@ -177,3 +181,20 @@ def test_held_out_outputs_are_of_whole_runs(windows):
     trained = fitted.predict_proba(features)[np.arange(len(y)), np.searchsorted(fitted.classes_, y)]
     held_out = fitted.inner_probability_[np.arange(len(y)), np.searchsorted(fitted.classes_, y)]
     assert held_out.mean() < trained.mean()  # runs that it was not fitted on
+
+
+@pytest.mark.parametrize("left_out", [(), ("GRASS_2", "GRASS_4", "GRAVEL_1")])
+def test_training_takes_a_terrain_filter_only_where_it_is_no_worse_than_single_windows(runs, left_out):
+    """Three drawn runs are mostly taken for another terrain when they are held out, which a filter makes worse."""
+    data = data_of_runs([run for run in runs if run.run_id not in left_out], RecipeSettings())
+    samples, windows = data.samples, data.samples.windows
+    data.recipe[-1].fit(data.rows, samples.terrain, groups=samples.group)
+    info = info_of(data, RecipeSettings(), "")
+    model, notes = with_limits(data.recipe, info, samples, data.features, data.motion)
+    settings, held_out = filter_of(model.info), data.recipe[-1].inner_probability_
+    assert (settings is None) == (not left_out) == any("filtered over time" in note for note in notes)
+    assert (filtered(model).over_time is None) == (settings is None)
+    if settings is not None:
+        belief = filter_sessions(held_out, windows.start_s + 2.0, windows.groups, 2.0, settings)
+        truth = np.searchsorted(model.info.classes, samples.terrain)
+        assert np.mean(reported(belief) == truth) >= np.mean(held_out.argmax(axis=1) == truth)
