@@ -245,7 +245,18 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
         """
         return self.named(windows)[1]
 
-    transform = features_of  # of a subclass, whose matrix holds more or other columns, another
+    def transform(self, X: Windows) -> Array:
+        """Return the matrix (n_windows, n_columns) that the last step takes; errors as of features."""
+        return self.matrix(X, self.features_of(X) if self.uses_features else np.empty((len(X), 0)))
+
+    @property
+    def uses_features(self) -> bool:
+        """Whether the matrix holds the features."""
+        return True
+
+    def matrix(self, windows: Windows, features: Array) -> Array:
+        """Return the matrix of windows whose features are known: these; of a subclass, more or other columns."""
+        return features
 
     def equals(self, other: FeatureExtractor) -> bool:
         """Whether both give the same features of a window, but for rounding."""
@@ -330,6 +341,35 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
         return np.array([f"{name} [{unit}]" for name, unit, _ in self.features_], dtype=object)
 
 
+class PlainExtractor(FeatureExtractor):
+    """Turn windows into mean and standard deviation of each channel, and nothing else: what a baseline has.
+
+    Examples
+    --------
+    >>> windows = Windows({"imu": np.array([[[1.0, 3.0]]])}, {"imu": ("accel_z_mps2",)}, {"imu": 1.0}, 2.0,
+    ...                   np.zeros(1), np.array(["a"]), np.array(["grass"]))
+    >>> PlainExtractor().fit_transform(windows)
+    array([[2., 1.]])
+    """
+
+    def named(self, windows: Windows) -> tuple[list[Feature], Array]:
+        """Return these features beside their values; NaN where a sample is."""
+        features, parts = list[Feature](), [np.empty((len(windows), 0))]
+        for stream, values in self.selected(windows).items():
+            names = self.layout_.channels[stream]
+            for name, of_window in (("mean", values.mean(axis=2)), ("std", values.std(axis=2))):
+                parts.append(of_window)
+                features += [
+                    Feature(
+                        f"{stream}.{channel.rpartition('_')[0]}.{name}",
+                        UNIT_SYMBOLS[unit_of(channel)],
+                        frozenset({signal_set_of(stream, channel) or ""}),
+                    )
+                    for channel in names
+                ]
+        return features, np.concatenate(parts, axis=1)
+
+
 @dataclass(eq=False, repr=False)
 class SampleExtractor(FeatureExtractor):
     """Turn windows into the matrix of their samples, with or without their features before them.
@@ -364,10 +404,15 @@ class SampleExtractor(FeatureExtractor):
         )
         return self
 
-    def transform(self, X: Windows) -> Array:
-        """Return the matrix (n_windows, n_columns), samples centred where they must be; errors as of the features."""
-        parts = [self.features_of(X)] if self.with_features else []
-        for stream, values in self.selected(X).items():
+    @property
+    def uses_features(self) -> bool:
+        """Whether the matrix holds the features, as it was asked to."""
+        return self.with_features
+
+    def matrix(self, windows: Windows, features: Array) -> Array:
+        """Return the samples, centred where they must be, after the features where they are asked for."""
+        parts = [features] if self.with_features else []
+        for stream, values in self.selected(windows).items():
             names = self.layout_.channels[stream]
             centred = np.array([is_centred(stream, name, self.level_sets) for name in names])[:, None]
             mean = np.where(centred, values.mean(axis=2, keepdims=True), 0.0)
@@ -445,21 +490,21 @@ class FunctionExtractor(FeatureExtractor):
         self.own_names_ = tuple(self._numbers(X, 0)[1]) if len(X) else ()
         return self
 
-    def transform(self, X: Windows) -> Array:
-        """Return the matrix (n_windows, n_columns); errors as of features.
+    def matrix(self, windows: Windows, features: Array) -> Array:
+        """Return the features, and in the last columns the own ones.
 
         ``ConfigError`` where a function fails, or gives what is no number or has other names than in ``fit``.
         """
-        own = np.empty((len(X), len(self.own_names_)))
-        for row in range(len(X)):
-            place, numbers = self._numbers(X, row)
+        own = np.empty((len(windows), len(self.own_names_)))
+        for row in range(len(windows)):
+            place, numbers = self._numbers(windows, row)
             if tuple(numbers) != self.own_names_:
                 raise ConfigError(
                     f"own features of {place} are {', '.join(numbers)}; those of the first window are "
                     f"{', '.join(self.own_names_)}"
                 )
             own[row] = list(numbers.values())
-        return np.concatenate([self.features_of(X), own], axis=1)
+        return np.concatenate([features, own], axis=1)
 
     def get_feature_names_out(self, input_features: Any = None) -> Array:
         """Return the name of each column, of the package's own features with the unit."""

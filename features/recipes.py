@@ -12,6 +12,7 @@ from sklearn.pipeline import Pipeline
 from features.extractor import (
     FeatureExtractor,
     FunctionExtractor,
+    PlainExtractor,
     SampleExtractor,
     WindowFunction,
 )
@@ -21,9 +22,13 @@ from terrain.errors import ConfigError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows
 
-#: SVM on features, network on samples, both joined, and which of these three held-out runs favour; and what wheels
-#: answer to how they are driven.
-RECIPES = ("svm", "cnn", "stack", "best", "response")
+#: SVM and trees on features, network on samples, SVM and network joined, and which of these four held-out runs favour;
+#: what wheels answer to how they are driven; and a baseline, boosted trees on means and standard deviations.
+RECIPES = ("svm", "trees", "cnn", "stack", "best", "response", "plain")
+WITH_FUNCTIONS = (
+    "svm",
+    "trees",
+)  #: Recipes that take own functions of a window, as one's own classifiers do.
 
 
 class WindowPipeline(Pipeline):
@@ -42,9 +47,9 @@ class WindowPipeline(Pipeline):
 
     def probabilities(self, windows: Windows, features: Array | None = None) -> Array:
         """Return probabilities (n_windows, k), from the windows' features where they are there already."""
-        if features is None or type(self[0]) is not FeatureExtractor:
+        if features is None or getattr(type(self[0]), "transform", None) is not FeatureExtractor.transform:
             return np.asarray(self.predict_proba(windows))
-        return np.asarray(self[-1].predict_proba(features))
+        return np.asarray(self[-1].predict_proba(self[0].matrix(windows, features)))
 
 
 def make_recipe(
@@ -84,14 +89,20 @@ def make_recipe(
     if isinstance(recipe, str) and recipe not in RECIPES:
         raise ConfigError(f"there is no recipe {recipe!r}; there are {', '.join(RECIPES)}")
     sets = tuple(signal_sets), tuple(level_sets)
-    if functions and isinstance(recipe, str) and recipe != "svm":
-        raise ConfigError(f"recipe {recipe!r} does not take features of your own; 'svm' does")
+    if functions and isinstance(recipe, str) and recipe not in WITH_FUNCTIONS:
+        takers = " and ".join(map(repr, WITH_FUNCTIONS))
+        raise ConfigError(f"recipe {recipe!r} does not take features of your own; {takers} do")
     features: FeatureExtractor = FeatureExtractor(*sets)
     if functions:
         features = FunctionExtractor(*sets, tuple(functions))
     classifier: ClassifierMixin
     if recipe == "svm":
         classifier = GroupedSVC(candidates, gap=gap, seed=seed)
+    elif recipe in ("trees", "plain"):
+        from terrain.classify.trees import GroupedTrees
+
+        features = PlainExtractor(*sets) if recipe == "plain" else features
+        classifier = GroupedTrees(boosted=recipe == "plain", gap=gap, seed=seed)
     elif recipe == "cnn":
         from terrain.classify.network import GroupedNetwork
 

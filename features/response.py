@@ -52,9 +52,14 @@ class ResponseExtractor(FeatureExtractor):
         self.columns_ = ResponseColumns(len(wheels), len(wheels) * len(quantities))
         return self
 
-    def transform(self, X: Windows) -> Array:
+    @property
+    def uses_features(self) -> bool:
+        """Whether the matrix holds the features: it does not."""
+        return False
+
+    def matrix(self, windows: Windows, features: Array) -> Array:
         """Return the matrix (n_windows, n_wheels + n_responses); NaN where a window has no sample."""
-        values, (wheels, quantities) = self.selected(X), self._responses()
+        values, (wheels, quantities) = self.selected(windows), self._responses()
         rows = {
             name: values[stream][:, i]
             for stream, names in self.layout_.channels.items()

@@ -99,6 +99,14 @@ def datasets_dir(measured):
     return borealtc.parent
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _configuration(tmp_path_factory):
+    """Give the tests a configuration folder of their own: no module of a user's is trusted, and none becomes so."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("configuration")))
+        yield
+
+
 IMU = ("gyro_x_radps", "gyro_y_radps", "gyro_z_radps", "accel_x_mps2", "accel_y_mps2", "accel_z_mps2")
 WHEELS = ("speed_left_mps", "speed_right_mps", "current_left_a", "current_right_a")
 IMU_RATE_HZ, WHEEL_RATE_HZ = 50.0, 10.0

@@ -172,10 +172,8 @@ def compare(settings: Settings, inputs: DriveInputs, progress: Progress = silent
         LivePilot(inputs.robot, controller.table, None, controller.pilot)
     _situation(settings, inputs, settings.first_seed)
     if settings.needs_model and inputs.model is None:
-        from pipelines.learn.model_file import read_model
-
         given, seed = settings.model, settings.first_seed
-        model = read_model(given) if given else train_classifier(inputs.robot, seed, progress)
+        model = settings.read_model(given) if given else train_classifier(inputs.robot, seed, progress)
         inputs = replace(inputs, model=model)
 
     def drive_all(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
+from pipelines.learn.settings import TrustSettings
 from pipelines.report.settings import ByCommas, JobsSettings, Names, setting
 from pipelines.report.settings import Settings as BaseSettings
 from terrain.control.controllers import CONTROLLERS, KINDS, uses_classifier
@@ -47,7 +48,7 @@ class DrivenSettings(JobsSettings):
     out: Path | None = setting(None, "Folder of the page, with --path also of the table of the drive.")
 
 
-class ComparisonSettings(BaseSettings):
+class ComparisonSettings(TrustSettings):
     """Comparison of controllers."""
 
     scenario: str = setting("starts")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -27,10 +28,10 @@ class TerrainClassifier(ClassifierMixin, BaseEstimator):
 
     Parameters
     ----------
-    recipe : name of a recipe, as ``svm``, ``cnn``, ``stack``, ``best``; or a scikit-learn classifier of features
+    recipe : name of a recipe, as ``svm``, ``trees``, ``cnn``, ``best``; or a scikit-learn classifier of features
     signal_sets : whose channels are used
     seed : deals runs into inner folds
-    functions : own functions of a window, beside the features; a classifier with them cannot be saved
+    functions : own functions of a window, beside the features
 
     Attributes
     ----------
@@ -137,7 +138,7 @@ class TerrainClassifier(ClassifierMixin, BaseEstimator):
         ConfigError
             if the folder holds something else than a model.
         ModelError
-            if the estimator is of no library whose types a model may hold.
+            if estimator or functions cannot be found again by the name of a module.
         """
         check_is_fitted(self, "model_")
         place = Path(folder)
@@ -150,16 +151,22 @@ class TerrainClassifier(ClassifierMixin, BaseEstimator):
         return place
 
     @classmethod
-    def load(cls, source: str | Path) -> Self:
+    def load(cls, source: str | Path, trust: Iterable[str] = ()) -> Self:
         """Return a fitted classifier of a folder, or of a registered model by its URI.
+
+        Parameters
+        ----------
+        source : folder or URI
+        trust : modules of one's own that the model may run, beside those that ``--trust`` has remembered
 
         Raises
         ------
         ModelError
-            if there is no such model, or it is damaged or foreign.
+            if there is no such model, it is damaged or foreign, or needs a module that is not trusted.
         """
-        model = read_model(source)
-        found = cls(model.info.recipe, tuple(model.info.signal_sets) or SIGNAL_SETS, model.info.seed)
+        model = read_model(source, trust)
+        signal_sets, functions = tuple(model.info.signal_sets), getattr(model.recipe[0], "functions", ())
+        found = cls(model.info.recipe, signal_sets or SIGNAL_SETS, model.info.seed, tuple(functions))
         found.model_ = model
         found.classes_ = np.asarray(model.recipe.classes_, dtype=object)
         return found

@@ -61,9 +61,8 @@ def run(settings: Settings, progress: Progress = silent) -> CrossvalResult | Com
             asked, digest = settings.with_(skip_short=settings.repair), data_digest(runs)
             if settings.model:
                 from pipelines.learn.comparison import compare_models
-                from pipelines.learn.model_file import read_model
 
-                found = compare_models(runs, [read_model(each) for each in settings.model], asked)
+                found = compare_models(runs, [settings.read_model(each) for each in settings.model], asked)
             else:
                 found = crossval(runs, asked, progress)
     named = replace(found, dataset=settings.dataset, data_digest=digest, data=str(settings.data))

@@ -51,8 +51,8 @@ from terrain.classify.svm import GroupedSVC
 from terrain.errors import DataError
 from terrain.records import Array
 
-CHECKED_WITH = FEATURE_RECIPE
-"""The recipe of the checks beside the figures: they are of the data, and have many fits."""
+CHECKED_WITH, BASELINE = FEATURE_RECIPE, "plain"
+"""The recipe of the checks beside the figures: they are of the data, and have many fits; what a recipe must beat."""
 
 NO_EXTRAS = (
     "from cached features: speed alone, slow against fast, the learning curve and terrain over time need the "
@@ -254,9 +254,11 @@ def _extras(
     windows, terrain, seed = samples.windows, samples.terrain, settings.seed
     first = [result.fold for result in held_out.results if result.fold.repeat == 0]
 
-    def accuracies(features: Array, folds: Sequence[Fold], task: str) -> list[float]:
+    def accuracies(
+        features: Array, folds: Sequence[Fold], task: str, fitted: Any = classifier
+    ) -> list[float]:
         examples = Examples(features, terrain, samples.group)
-        return evaluate(classifier, examples, folds, settings.jobs, task, progress).accuracies
+        return evaluate(fitted, examples, folds, settings.jobs, task, progress).accuracies
 
     own = classifier is recipe[-1]
     full = held_out.accuracies[0] if own else accuracies(features, first, CHECKED_WITH)[0]
@@ -264,6 +266,8 @@ def _extras(
     if wheel_stream(windows.channels) is not None:
         wheels = FeatureExtractor(("wheels",), ("wheels",)).fit_transform(windows)
         speed_only = accuracies(wheels, first, "speed only")[0]
+    plain = recipe_of(settings.with_(feature=()), BASELINE)
+    plain_accuracy = accuracies(feature_matrix(plain, windows), first, BASELINE, plain[-1])[0]
     side, slow_fast = slow_and_fast(samples)
     if slow_fast.status is Applicability.APPLICABLE:
         slow, fast = np.flatnonzero(side == "slow"), np.flatnonzero(side == "fast")
@@ -275,6 +279,7 @@ def _extras(
     spliced = sequence_figures([track for track in tracks if track.spliced], seed)
     found = {
         "speed_only_accuracy": speed_only,
+        "plain_accuracy": plain_accuracy,
         "slow_fast": slow_fast,
         "learning_curve": learning_curve(runs_per_class, curve, full),
         "courses": spliced,

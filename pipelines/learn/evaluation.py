@@ -86,6 +86,9 @@ class CrossvalResult(Result):
     repaired: Mapping[str, int] = described("what a repairing reader changed, by kind")
     notes: tuple[str, ...] = described("what a reader has to know")
     speed_only_accuracy: float | None = optional("accuracy from wheel speed alone", "1")
+    plain_accuracy: float | None = optional(
+        "accuracy of boosted trees on means and standard deviations (recipe plain)", "1"
+    )
     slow_fast: SlowFast | None = optional("slow runs train and fast ones test, and the reverse")
     learning_curve: LearningCurve | None = optional("accuracy by number of training runs")
     filtered_accuracy: float | None = optional("accuracy of the filter over time", "1")
@@ -174,7 +177,7 @@ def report(result: CrossvalResult) -> Report:
     dataset, curve, drives = result.dataset or "windows", result.learning_curve, result.next_drives
     decide: list[tuple[Any, ...]] = [("always the most frequent terrain", result.chance, PERCENT)]
     if curve is not None:
-        decide += [*result.pairs("speed_only_accuracy"), ("number of runs", curve.statement)]
+        decide += [*result.pairs("speed_only_accuracy", "plain_accuracy"), ("number of runs", curve.statement)]
     if (found := result.refusals) is not None:
         refused, ends, worst = (
             format_value(each, PERCENT) for each in (found.refused, found.refused_ci, found.worst_run)
@@ -336,7 +339,7 @@ def _checks(result: CrossvalResult) -> list[Part]:
     assert curve is not None
     out = [f"{name} left out ({reason})" for name, reason in found.left_out.items()]
     rows = [
-        *result.pairs("speed_only_accuracy"),
+        *result.pairs("speed_only_accuracy", "plain_accuracy"),
         ("trained on slow runs, tested on fast ones", found.slow_to_fast, PERCENT),
         ("the reverse", found.fast_to_slow, PERCENT),
         ("slow and fast runs", "; ".join([str(found.status), *out])),

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Self
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError, model_validator
 
+from pipelines.learn.settings import TrustSettings
 from pipelines.report.numbers import enumerated, format_value, plural
 from pipelines.report.results import Progress, Result, described, silent
-from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
 from pipelines.report.tree import Column, Report, Section, Table, Text
 from terrain.errors import ConfigError, DataError, LogError
@@ -32,7 +32,7 @@ PERCENT = ".1%"
 SOURCES_FILE = "label_sources.json"  #: Beside a run: where each of its labels comes from
 
 
-class Settings(BaseSettings):
+class Settings(TrustSettings):
     """Whose windows are listed."""
 
     data: Path = setting(..., "A run folder, or a folder of run folders.", option="FOLDER")
@@ -151,13 +151,12 @@ def _propose(settings: Settings, model_uri: str) -> ProposalsResult:
     import pandas as pd
 
     from pipelines.data.datasets import load_runs
-    from pipelines.learn.model_file import read_model
     from pipelines.live.model import assess
     from pipelines.live.windows import prior_of, windows_of_log
     from terrain.classify.proposals import propose, questions, taken_from
     from terrain.files.atomic import atomic_write
 
-    model, runs = read_model(model_uri), load_runs(settings.data)
+    model, runs = settings.read_model(model_uri), load_runs(settings.data)
     of_model = model.info.classes, prior_of(model.info)
     proposals: list[Proposal] = []
     for run in runs:

@@ -1,7 +1,9 @@
 """A trained model as a folder: ``model.skops``, ``network.onnx`` where it has one, and a manifest.
 
-The scikit-learn part is loaded by skops with the fixed list of types below and nothing else, so that a file
-cannot bring code of its own; the network is an ONNX graph, of operators that only compute.  The manifest,
+The scikit-learn part is loaded by skops with the fixed list of types below, so that a file cannot bring code of its
+own; what a model needs of a user's modules stands in the manifest by name, and is imported where the user trusts them
+(:mod:`pipelines.learn.trust`).  Trees of scikit-learn are stored as arrays (:mod:`pipelines.learn.stored_trees`).
+The network is an ONNX graph, of operators that only compute.  The manifest,
 written last, says how windows must be cut and holds the checksums of all files: a damaged folder is
 distinguished from an intact one.  A registered model is a copy of such a folder.
 """
@@ -13,8 +15,9 @@ import io as streams
 import subprocess
 import sys
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -27,6 +30,8 @@ from pydantic import BaseModel, ConfigDict
 
 from features.extractor import is_centred
 from features.windows import Layout, WindowRule
+from pipelines.learn.stored_trees import trees_as_arrays, trees_of_arrays
+from pipelines.learn.trust import check_trusted, import_own
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain import __version__
 from terrain.classify.limits import Novelty, SupportTable, check_novelty, check_support
@@ -56,20 +61,30 @@ MAX_UNPACKED_BYTES = 1024 * MEBIBYTE
 
 _TRUSTED = {
     "builtins": "frozenset",
-    "features.extractor": "Feature FeatureExtractor SampleExtractor",
+    "features.extractor": "Feature FeatureExtractor FunctionExtractor PlainExtractor SampleExtractor",
     "features.recipes": "WindowPipeline",
     "features.response": "ResponseExtractor",
     "features.windows": "Layout",
     "numpy": "dtype",
+    "sklearn.calibration": "_CalibratedClassifier _SigmoidCalibration _TemperatureScaling",
+    "sklearn.gaussian_process._gpc": "_BinaryGaussianProcessClassifierLaplace",
+    "sklearn.gaussian_process.kernels": "ConstantKernel Matern Product RBF Sum WhiteKernel",
+    "sklearn.multiclass": "_ConstantPredictor",
+    "sklearn.neural_network._stochastic_optimizers": "AdamOptimizer SGDOptimizer",
+    "sklearn.utils._bunch": "Bunch",
     "terrain.classify.grouped": "OwnClassifier Preparation",
     "terrain.classify.limits": "Novelty SupportTable",
     "terrain.classify.network": "Augmentation GroupedNetwork NetworkChoice SampleColumns Trial",
     "terrain.classify.response": "GroundResponse GroupedResponse Process ResponseChoice ResponseColumns",
     "terrain.classify.stack": "GroupedStack StackChoice",
     "terrain.classify.svm": "Candidate GroupedSVC",
+    "terrain.classify.trees": "Forest GroupedTrees",
 }
 TRUSTED_TYPES = tuple(f"{module}.{name}" for module, names in _TRUSTED.items() for name in names.split())
 """Types beyond those that skops trusts itself which a model of this package may hold."""
+
+Own = tuple[str, ...]
+"""``MODULE.NAME`` of what a model needs of a user's modules."""
 
 
 def model_info(layout: Layout, rule: WindowRule, terrain: Array, **known: Any) -> ModelInfo:
@@ -100,8 +115,8 @@ class Manifest(BaseModel):
     info: ModelInfo
 
 
-def write_model(folder: Path, model: TerrainModel) -> None:
-    """Write a model's files into a folder in place of those that lie there, the manifest last.
+def write_model(folder: Path, model: TerrainModel) -> Own:
+    """Write a model's files into a folder in place of those that lie there, the manifest last; return its own code.
 
     Raises
     ------
@@ -115,7 +130,7 @@ def write_model(folder: Path, model: TerrainModel) -> None:
     try:
         if network is not None:
             network.onnx_ = b""  # it lies in a file of its own
-        content = packed({"recipe": model.recipe, "novelty": model.novelty, "support": model.support})
+        content, own = packed({"recipe": model.recipe, "novelty": model.novelty, "support": model.support})
     finally:
         if network is not None:
             network.onnx_ = graph
@@ -129,7 +144,8 @@ def write_model(folder: Path, model: TerrainModel) -> None:
             for each in network.columns
         }
         atomic_write(folder / ONNX_FILE, with_centred(graph, centred, model.info.window_s))
-    seal(folder, model.info)
+    seal(folder, replace(model.info, own_code=own))
+    return own
 
 
 @cache
@@ -145,21 +161,26 @@ def skops_io() -> ModuleType:
             del sys.modules[name]
 
 
-def packed(fitted: Any) -> bytes:
-    """Return what a model file holds of fitted parts.
+def packed(fitted: Any) -> tuple[bytes, Own]:
+    """Return what a model file holds of fitted parts, and what it needs of a user's modules.
 
     Raises
     ------
     ModelError
         if one is of a type that could not be read back.
     """
-    content: bytes = skops_io().dumps(fitted)
-    if foreign := _foreign_type(content):
+    try:
+        with trees_as_arrays(fitted):
+            content: bytes = skops_io().dumps(fitted)
+        own = _foreign_types(content)
+        import_own(own)
+        trees_of_arrays(skops_io().loads(content, trusted=[*TRUSTED_TYPES, *own]))
+    except Exception as error:  # skops raises whatever it cannot store
         raise ModelError(
-            f"{foreign} cannot be stored: a model file holds only types that can be checked when it is read, "
-            "those of this package and most of scikit-learn's, trees not among them; crossval evaluates all"
-        )
-    return content
+            f"the recipe cannot be stored ({_words(error)}): a model file holds types of this package and of "
+            "scikit-learn, and functions and classes at the top of a module of yours; crossval evaluates all"
+        ) from error
+    return content, own
 
 
 def seal(folder: Path, info: ModelInfo) -> None:
@@ -170,20 +191,25 @@ def seal(folder: Path, info: ModelInfo) -> None:
     atomic_write(folder / MANIFEST_FILE, manifest.model_dump_json(indent=2) + "\n")
 
 
-def read_model(source: str | Path) -> TerrainModel:
+def read_model(source: str | Path, trust: Iterable[str] = ()) -> TerrainModel:
     """Read a model: a folder, or a registered one (``models:/NAME@champion``, ``models:/NAME/3``, ``runs:/...``).
+
+    Parameters
+    ----------
+    source : folder or name
+    trust : modules of one's own that it may import, beside those that were trusted before
 
     Raises
     ------
     ModelError
-        if there is no such model, it is none of this package, is damaged, or holds a type that is not on the
-        list.
+        if there is no such model, it is none of this package, is damaged, holds a type that is not on the
+        list, or needs a module that is not trusted.
     """
     with model_folder(source) as folder:
         info, contents = read_files(folder)
     file = folder / MODEL_FILE
     try:
-        recipe, novelty, support = _unpacked(contents[MODEL_FILE])
+        recipe, novelty, support = _unpacked(contents[MODEL_FILE], info.own_code, trust)
         if (network := _network(recipe)) is not None:
             file = folder / ONNX_FILE
             network.onnx_ = with_centred(contents[ONNX_FILE], {}, info.window_s)
@@ -204,6 +230,8 @@ def read_model(source: str | Path) -> TerrainModel:
                 raise DataError(f"its novelty score is of {novelty.n_features} features; it has {n_features}")
     except ConfigError:
         raise
+    except ModelError as error:
+        raise ModelError(f"{source}: {error}") from error
     except Exception as error:  # skops, numpy and scikit-learn raise whatever a stranger's file leads them to
         raise ModelError(f"{file}: cannot be loaded ({_words(error)})") from error
     return TerrainModel(recipe, info, novelty, support)
@@ -335,7 +363,9 @@ def _network(recipe: WindowPipeline) -> Any:
     return last if hasattr(last, "onnx_") else getattr(last, "network_", None)
 
 
-def _unpacked(content: bytes) -> tuple[WindowPipeline, Novelty | None, SupportTable | None]:
+def _unpacked(
+    content: bytes, own: Own, trust: Iterable[str]
+) -> tuple[WindowPipeline, Novelty | None, SupportTable | None]:
     """Return recipe, novelty score and support of a model file; ``DataError`` says why it is none."""
     from features.recipes import WindowPipeline
 
@@ -343,9 +373,13 @@ def _unpacked(content: bytes) -> tuple[WindowPipeline, Novelty | None, SupportTa
         unpacked_bytes = sum(entry.file_size for entry in archive.infolist())
     if unpacked_bytes > MAX_UNPACKED_BYTES:
         raise DataError(f"it unpacks to {unpacked_bytes} bytes, {MAX_UNPACKED_BYTES} are read")
-    if foreign := _foreign_type(content):
-        raise DataError(f"it holds {foreign}, a type that models of this package do not hold")
-    found = skops_io().loads(content, trusted=list(TRUSTED_TYPES))
+    if foreign := set(_foreign_types(content)) - set(own):
+        name = printable(min(foreign)[:MAX_NAME])
+        raise DataError(f"it holds {name}, a type that models of this package do not hold")
+    check_trusted(own, trust)
+    import_own(own)
+    found = skops_io().loads(content, trusted=[*TRUSTED_TYPES, *own])
+    trees_of_arrays(found)
     parts = found if isinstance(found, dict) else {"recipe": found}
     recipe, novelty, support = (parts.get(name) for name in ("recipe", "novelty", "support"))
     if not isinstance(recipe, WindowPipeline):
@@ -358,10 +392,9 @@ def _unpacked(content: bytes) -> tuple[WindowPipeline, Novelty | None, SupportTa
     return recipe, novelty, support
 
 
-def _foreign_type(content: bytes) -> str:
-    """Return the first type in a file that is not on the list; empty where all are."""
-    foreign = sorted(set(skops_io().get_untrusted_types(data=content)) - set(TRUSTED_TYPES))
-    return printable(foreign[0][:MAX_NAME]) if foreign else ""
+def _foreign_types(content: bytes) -> Own:
+    """Return the types and functions in a file that are not on the list, as ``MODULE.NAME``."""
+    return tuple(sorted(set(skops_io().get_untrusted_types(data=content)) - set(TRUSTED_TYPES)))
 
 
 def _words(error: Exception) -> str:

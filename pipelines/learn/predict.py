@@ -18,6 +18,7 @@ from pydantic import model_validator
 
 from pipelines.data.datasets import load
 from pipelines.data.settings import AlignedRunsSettings
+from pipelines.learn.settings import TrustSettings
 from pipelines.report.figure import Figure, Panel, Strip
 from pipelines.report.numbers import format_counts, format_value, plural
 from pipelines.report.results import Progress, Result, as_json, described, silent
@@ -45,7 +46,7 @@ MAX_ROWS, MAX_STRIPS = 8, 12
 PERCENT = ".1%"
 
 
-class PredictionSettings(BaseSettings):
+class PredictionSettings(TrustSettings):
     """Prediction: which model predicts, and which table gives the target slips."""
 
     model: str = setting("", "models:/NAME@champion, models:/NAME/3, or a model folder.")
@@ -174,7 +175,6 @@ def _changes(settings: Settings, progress: Progress) -> ChangesResult:
 
 
 def _predictions(settings: Settings) -> Predictions:
-    from pipelines.learn.model_file import read_model
     from pipelines.live.windows import filtered
     from terrain.control.slip_table import load_slip_table
     from terrain.robots import load_robot
@@ -182,7 +182,7 @@ def _predictions(settings: Settings) -> Predictions:
     table = load_slip_table(settings.table)
     runs, skipped = load(settings)
     robot = None if settings.robot is None else load_robot(settings.robot)
-    model = filtered(read_model(settings.model), settings.filter_stride_s)
+    model = filtered(settings.read_model(settings.model), settings.filter_stride_s)
     found = predict(runs, model, table, robot=robot, skip_short=settings.repair)
     return replace(found, model=settings.model, dataset=settings.dataset, skipped=tuple(skipped))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import sys
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from features.recipes import WindowPipeline, make_recipe
 from pipelines.learn.settings import FEATURE_RECIPE, WITHOUT_SVM, LearnSettings
+from pipelines.learn.trust import use_current_folder
 from terrain.classify.svm import Candidate
 from terrain.errors import ConfigError
 from terrain.files.documents import MAX_JSON_BYTES, parse_document
@@ -84,9 +84,7 @@ def load_named(text: str) -> Any:
     terrain.errors.ConfigError: math:squirt: module 'math' has no 'squirt'
     """
     module_name, _, name = text.partition(":")
-    folder = str(Path.cwd())
-    if folder not in sys.path:
-        sys.path.append(folder)  # last, so that a file of the folder hides no library
+    use_current_folder()
     try:
         module = importlib.import_module(module_name)
     except Exception as error:

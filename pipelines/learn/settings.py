@@ -14,10 +14,19 @@ from terrain.logs.schema import SIGNAL_SETS, check_signal_sets
 
 if TYPE_CHECKING:
     from features.windows import WindowRule
+    from pipelines.live.model import TerrainModel
 
-RECIPES = ("svm", "cnn", "stack", "best", "response")  #: The names of ``features.recipes.RECIPES``
+RECIPES = (
+    "svm",
+    "trees",
+    "cnn",
+    "stack",
+    "best",
+    "response",
+    "plain",
+)  #: The names of ``features.recipes.RECIPES``
 FEATURE_RECIPE = "svm"  #: The recipe that learns from features alone, and so from cached ones
-WITHOUT_SVM = ("cnn", "response")
+WITHOUT_SVM = ("trees", "cnn", "response", "plain")
 
 ProtocolName = Literal[
     "grouped",
@@ -37,8 +46,8 @@ WINDOW_S = 2.0
 PUBLISHED_WINDOW_S = 1.7
 
 RECIPE_TEXT = (
-    "svm on features, cnn (network on samples), stack (both joined), best of these three, response of the "
-    "wheels; MODULE:NAME of a scikit-learn classifier of your own. @SET,SET after it: signal sets."
+    "svm or trees on features, cnn (network on samples), stack (svm and cnn joined), best of these four, response of "
+    "wheels, plain (baseline); MODULE:NAME of a scikit-learn classifier of your own. @SET,SET after it: signal sets."
 )
 
 
@@ -94,6 +103,21 @@ def check_rates(texts: tuple[str, ...]) -> tuple[str, ...]:
     for text in texts:
         stream_rate(text)
     return texts
+
+
+class TrustSettings(Settings):
+    """Models that need code of one's own."""
+
+    trust: tuple[str, ...] = setting((), repeated=True)
+    """Module of your own that the model may run; remembered, and may be given again."""
+
+    def read_model(self, source: str | Path) -> TerrainModel:
+        """Remember what is trusted, and read a model; errors as of both."""
+        from pipelines.learn.model_file import read_model
+        from pipelines.learn.trust import remember
+
+        remember(self.trust)
+        return read_model(source)
 
 
 class WindowSettings(Settings):
@@ -173,7 +197,7 @@ class RecipeSettings(LearnSettings):
     recipe: Annotated[str, AfterValidator(check_recipe)] = setting(FEATURE_RECIPE, RECIPE_TEXT)
 
 
-class EvaluationSettings(LearnSettings):
+class EvaluationSettings(LearnSettings, TrustSettings):
     """Evaluation: what is compared, and which windows are held out."""
 
     recipe: Annotated[tuple[str, ...], AfterValidator(split_recipes)] = setting(

@@ -163,6 +163,7 @@ def train(
     from pipelines.learn.rates import at_lower_rates, least_rates
     from pipelines.learn.tracking import log_training
     from pipelines.learn.training_data import info_of, with_limits
+    from pipelines.learn.trust import remember
     from pipelines.report.drawing import figure_png
     from pipelines.report.tree import figures_of
     from pipelines.report.versions import versions
@@ -223,7 +224,7 @@ def train(
     pictures = {f"figures/{place}.png": figure_png(figure) for place, figure in drawn}
     with TemporaryDirectory() as place:
         folder = settings.out or Path(place)
-        write_model(folder, model._replace(info=info))
+        remember(write_model(folder, model._replace(info=info)))
         card = write_training(folder, settings.name, record)
         try:
             registered = log_training(settings.name, folder, data, pictures)
@@ -247,21 +248,18 @@ def train(
 
 
 def _check_storable(data: TrainingData) -> None:
-    """Refuse what could not be stored before the work; a user's own classifier by a fit on a few windows."""
+    """Refuse what could not be stored before the work; what is a user's own by a fit on a few windows."""
     import numpy as np
     from sklearn.base import clone
 
-    from features.extractor import FunctionExtractor
     from pipelines.learn.model_file import packed
     from terrain.classify.grouped import OwnClassifier
     from terrain.classify.network import GroupedNetwork, require_onnx
     from terrain.classify.stack import GroupedStack
-    from terrain.errors import ModelError
 
-    if isinstance(data.recipe[0], FunctionExtractor):
-        raise ModelError("a model with features of your own cannot be stored: terrain crossval evaluates it")
+    packed(list(getattr(data.recipe[0], "functions", ())))
     own = data.recipe[-1]
-    if isinstance(own, GroupedNetwork | GroupedStack):
+    if isinstance(own, GroupedNetwork) or (isinstance(own, GroupedStack) and not own.choose):
         require_onnx()
     if isinstance(own, OwnClassifier):
         terrain = data.samples.terrain

@@ -48,6 +48,7 @@ class ModelInfo:
     commit: str = described("of the code", default="")
     robots: tuple[str, ...] = described("robots whose runs it was trained on", default=())
     filter: str = described("filter whose estimates it uses; empty where it uses none", default="")
+    own_code: tuple[str, ...] = described("MODULE.NAME of all that it needs beside the package", default=())
     conformal: float | None = described("threshold of the sets of terrains, None without", default=None)
     share_power: float | None = described(
         "power of the class ratios that the terrain filter divides by; None where single windows are better",

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from pydantic import model_validator
 
 from pipelines.data.settings import ReadSettings
+from pipelines.learn.settings import TrustSettings
 from pipelines.report.numbers import enumerated, plural
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
@@ -39,7 +40,7 @@ SHORTEST_TOKEN = 16  #: Characters; a shorter one can be tried out
 LONGEST_TOKEN = 512
 
 
-class ServedSettings(BaseSettings):
+class ServedSettings(TrustSettings):
     """What is served."""
 
     model: str | None = setting(None)
@@ -57,10 +58,9 @@ def loaded(settings: ServedSettings, name: str | None) -> TerrainModel | None:
     """Return a model by its name, filtered over time where the settings have it so; None without a name."""
     if name is None:
         return None
-    from pipelines.learn.model_file import read_model
     from pipelines.live.windows import filtered
 
-    return filtered(read_model(name), settings.filter_stride_s)
+    return filtered(settings.read_model(name), settings.filter_stride_s)
 
 
 class ServiceSettings(BaseSettings):

@@ -34,6 +34,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -397,6 +398,11 @@ class Training:
                 return self.head(torch.cat(pooled, 1))
 
         return Network()
+
+
+def can_fit() -> bool:
+    """Return whether torch, which fits networks, and what stores them are installed."""
+    return all(find_spec(name) is not None for name in ("torch", "onnx", "onnxruntime"))
 
 
 def require_onnx() -> Any:

@@ -1,13 +1,15 @@
-"""The support vector machine on features and the network on samples, joined on held-out runs.
+"""The support vector machine on features and the network on samples, joined on held-out runs; or the best of all.
 
 ``log p = w_svm log p_svm + w_net log p_net - log sum`` with weights not below zero: where one of the two is
 uncertain, the other decides.  The weights make the true classes of held-out windows most likely; a penalty
 draws them towards one half each, the mean of the two, which is where few runs leave them.
+
+The best is chosen on the same held-out windows among the SVM, trees, the network and the stack.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,84 +19,95 @@ from scipy.special import log_softmax
 
 from terrain.classify.folds import fold_numbers, units_of
 from terrain.classify.grouped import GroupedClassifier
-from terrain.classify.network import GroupedNetwork, SampleColumns
+from terrain.classify.network import GroupedNetwork, SampleColumns, can_fit
 from terrain.classify.svm import CANDIDATES, GroupedSVC
+from terrain.classify.trees import GroupedTrees
 from terrain.errors import DataError
 from terrain.records import Array
 
 #: Of the squared distance of the weights from one half, against the mean log loss of a window.
 PENALTY = 0.1
 N_CROSS_FOLDS = 5
-#: The SVM is left only for what has a lower loss by so many standard errors over runs.
+#: What costs less, in time and memory, is left only for what has a lower loss by so many standard errors over runs.
 MIN_STANDARD_ERRORS = 1.0
+BY_COST = ("svm", "trees", "cnn", "stack")
 TINY = np.finfo(float).tiny
 
 
 class StackChoice(NamedTuple):
-    """What held-out runs chose: which is ``used`` (svm, cnn, stack), and the weights of the log probabilities.
+    """What held-out runs chose: which of :data:`BY_COST` is ``used``, and the weights of the log probabilities.
 
-    Losses are mean log losses of held-out runs, of the stack with weights of other runs.
+    Losses are mean log losses of held-out runs, of the stack with weights of other runs; None of what was not fitted.
     """
 
     used: str
     weight_svm: float
     weight_cnn: float
     loss_svm: float
-    loss_cnn: float
-    loss_stack: float
+    loss_trees: float | None
+    loss_cnn: float | None
+    loss_stack: float | None
 
 
 @dataclass(eq=False, repr=False)
 class GroupedStack(GroupedClassifier):
-    """Stack of :class:`GroupedSVC` and :class:`GroupedNetwork` that keeps runs whole.
+    """Stack of :class:`GroupedSVC` and :class:`GroupedNetwork` that keeps runs whole; or the best of all there are.
 
     Attributes
     ----------
     best_ : :class:`StackChoice`
-    svm_, network_ : the two, fitted; None where it is not used
+    svm_, trees_, network_ : fitted; None where it is not used
     """
 
     columns: Sequence[
         SampleColumns
     ] = ()  #: of the samples, the last columns of a row; the features are before them
-    #: use whichever of the SVM, the network and the stack held-out runs favour, instead of the stack
+    #: use whichever of SVM, trees, network and stack held-out runs favour, instead of the stack; without torch, of
+    #: SVM and trees
     choose: bool = False
     candidates: Sequence[Sequence[float]] = CANDIDATES  #: of the SVM
-    n_inner_folds: int = 3  #: of both, which are thus weighed on the same held-out runs
+    n_inner_folds: int = 3  #: of all, which are thus weighed on the same held-out runs
     n_members: int = 3  #: n_members, epochs, trial_epochs: of the network
     epochs: int = 30
     trial_epochs: int = 10
-    gap: int = 1  #: gap, seed: of both
+    gap: int = 1  #: gap, seed: of all
     seed: int = 0
 
     def fit(self, X: Array, y: Array, groups: Array | None = None) -> GroupedStack:
-        """Fit both and their weights; errors as of the two, and where rows hold no features beside the samples."""
+        """Fit all and their weights; errors as of each, and where rows hold no features beside the samples."""
         X, y, groups = self._training_rows(X, y, groups)
         features, samples = self._parts(X)
-        of_both: dict[str, Any] = {"n_inner_folds": self.n_inner_folds, "gap": self.gap, "seed": self.seed}
-        sizes: dict[str, Any] = {
-            "n_members": self.n_members,
-            "epochs": self.epochs,
-            "trial_epochs": self.trial_epochs,
-        }
-        svm = GroupedSVC(self.candidates, **of_both).fit(features, y, groups)
-        network = GroupedNetwork(self.columns, **sizes, **of_both).fit(samples, y, groups)
-        both = np.stack([svm.inner_probability_, network.inner_probability_])
-        rows = np.flatnonzero(np.isfinite(both).all(axis=(0, 2)))
+        of_all: dict[str, Any] = {"n_inner_folds": self.n_inner_folds, "gap": self.gap, "seed": self.seed}
+        fitted: dict[str, Any] = {"svm": GroupedSVC(self.candidates, **of_all).fit(features, y, groups)}
+        if self.choose:
+            fitted["trees"] = GroupedTrees(**of_all).fit(features, y, groups)
+        if not self.choose or can_fit():
+            sizes = {name: getattr(self, name) for name in ("n_members", "epochs", "trial_epochs")}
+            fitted["cnn"] = GroupedNetwork(self.columns, **sizes, **of_all).fit(samples, y, groups)
+        rows = np.flatnonzero(
+            np.all([np.isfinite(of.inner_probability_[:, 0]) for of in fitted.values()], axis=0)
+        )
         if not len(rows):
-            raise DataError("no window was held out by both the SVM and the network; add runs")
-        held_out, truth = both[:, rows], np.searchsorted(self.classes_, y[rows])
-        run = units_of(y, groups)[rows]
-        crossed = cross_joined(held_out, truth, run, self.seed)
-        losses = np.stack([-log_of_truth(each, truth) for each in (*held_out, crossed)])
-        used = chosen_of(losses, run) if self.choose else "stack"
-        alone = {"svm": np.array([1.0, 0.0]), "cnn": np.array([0.0, 1.0])}
-        weights = alone[used] if used in alone else fit_weights(held_out, truth)
-        self.best_ = StackChoice(used, *weights.tolist(), *losses.mean(axis=1).tolist())
-        self.inner_probability_ = np.full(both.shape[1:], np.nan)
-        self.inner_probability_[rows] = joined(held_out, weights)
-        self.svm_ = svm if weights[0] > 0 else None
-        self.network_ = network if weights[1] > 0 else None
+            raise DataError(f"no window was held out by all of {', '.join(fitted)}; add runs")
+        held_out = {name: each.inner_probability_[rows] for name, each in fitted.items()}
+        truth = np.searchsorted(self.classes_, y[rows])
+        unit = units_of(y, groups)[rows]
+        losses = {name: -log_of_truth(each, truth) for name, each in held_out.items()}
+        if "cnn" in fitted:
+            both = np.stack([held_out["svm"], held_out["cnn"]])
+            losses["stack"] = -log_of_truth(cross_joined(both, truth, unit, self.seed), truth)
+        used = chosen_of(losses, unit) if self.choose else "stack"
+        weights = (
+            fit_weights(both, truth) if used == "stack" else np.array([used == "svm", used == "cnn"], float)
+        )
+        means: dict[str, Any] = {f"loss_{name}": None for name in BY_COST}
+        means |= {f"loss_{name}": float(each.mean()) for name, each in losses.items()}
+        self.best_ = StackChoice(used, *weights.tolist(), **means)
+        self.inner_probability_ = np.full((len(y), len(self.classes_)), np.nan)
+        self.inner_probability_[rows] = joined(both, weights) if used == "stack" else held_out[used]
+        self.svm_ = fitted["svm"] if weights[0] > 0 else None
+        self.trees_ = fitted["trees"] if used == "trees" else None
+        self.network_ = fitted["cnn"] if weights[1] > 0 else None
         return self
 
     def _parts(self, X: Array) -> tuple[Array, Array]:
@@ -105,7 +118,8 @@ class GroupedStack(GroupedClassifier):
 
     def predict_proba(self, X: Array) -> Array:
         """Return calibrated probabilities (n, k) in the order of ``classes_``, of one alone unchanged."""
-        parts = zip((self.svm_, self.network_), self._parts(self._rows(X)), strict=True)
+        features, samples = self._parts(self._rows(X))
+        parts = ((self.svm_, features), (self.trees_, features), (self.network_, samples))
         found = [each.predict_proba(part) for each, part in parts if each is not None]
         weights = np.array([self.best_.weight_svm, self.best_.weight_cnn])
         return joined(np.stack(found), weights) if len(found) == 2 else found[0]
@@ -147,17 +161,19 @@ def cross_joined(probability: Array, class_index: Array, run: Array, seed: int) 
     return found
 
 
-def chosen_of(losses: Array, run: Array) -> str:
-    """Return which of SVM, network and stack the losses (3, n) of held-out windows favour.
+def chosen_of(losses: Mapping[str, Array], unit: Array) -> str:
+    """Return which of :data:`BY_COST` the losses (n,) by name of held-out windows favour.
 
-    The SVM, the cheapest, unless another has a lower loss by :data:`MIN_STANDARD_ERRORS`, by differences
-    paired by run.
+    The cheapest, unless one that costs more has a lower loss by :data:`MIN_STANDARD_ERRORS`, by differences paired by
+    unit (n,), the session or run of each window; and so on from that one.
     """
-    _, of_run = np.unique(run, return_inverse=True)
-    count = np.bincount(of_run)
-    mean = np.stack([np.bincount(of_run, weights=each) / count for each in losses])
-    difference = mean - mean[0]
-    error = difference.std(axis=1, ddof=1) / np.sqrt(len(count)) if len(count) > 1 else np.full(3, np.inf)
-    found = difference.mean(axis=1)
-    better = [i for i in (1, 2) if found[i] < -MIN_STANDARD_ERRORS * error[i]]
-    return ("svm", "cnn", "stack")[min(better, key=lambda i: found[i], default=0)]
+    _, of_unit = np.unique(unit, return_inverse=True)
+    count = np.bincount(of_unit)
+    mean = {name: np.bincount(of_unit, weights=each) / count for name, each in losses.items()}
+    chosen, *dearer = (name for name in BY_COST if name in losses)
+    for name in dearer:
+        lower = mean[chosen] - mean[name]
+        error = lower.std(ddof=1) / np.sqrt(len(count)) if len(count) > 1 else np.inf
+        if lower.mean() > MIN_STANDARD_ERRORS * error:
+            chosen = name
+    return chosen

@@ -38,7 +38,8 @@ def test_the_one_that_knows_has_the_weight_and_is_chosen():
     assert np.mean(stack.predict(test) == truth) > 0.9
     X, y, run = draw("features")
     best, (test, truth, _) = quick(choose=True).fit(X, y, run), draw("features", seed=1)
-    assert (best.best_.used, best.network_) == ("svm", None)
+    assert best.best_.used in ("svm", "trees")
+    assert best.network_ is None
     assert np.mean(best.predict(test) == truth) > 0.9
 
 
@@ -63,10 +64,27 @@ def test_the_choice_needs_more_than_the_noise_between_runs():
     rng = np.random.default_rng(0)
     svm = np.full(50, 0.5)
     noisy = np.repeat(0.49 + 2.0 * rng.standard_normal(10), 5)
-    assert chosen_of(np.stack([svm, noisy, noisy]), run) == "svm"
-    assert chosen_of(np.stack([svm, svm - 0.1, svm - 0.2]), run) == "stack"
-    assert chosen_of(np.stack([svm, svm - 0.2, svm - 0.1]), run) == "cnn"
-    assert chosen_of(np.stack([svm, svm - 9, svm - 9]), np.zeros(50)) == "svm"  # one run says nothing
+    even = {"svm": svm, "cnn": noisy, "stack": noisy}
+    assert chosen_of(even, run) == "svm"
+    assert chosen_of(even | {"trees": svm - 0.1}, run) == "trees"
+    assert chosen_of({"svm": svm, "cnn": svm - 0.1, "stack": svm - 0.2}, run) == "stack"
+    assert chosen_of({"svm": svm, "cnn": svm - 0.2, "stack": svm - 0.1}, run) == "cnn"
+    level = {"svm": svm, "trees": svm - 0.2, "cnn": noisy - 0.2, "stack": svm - 0.2}
+    assert chosen_of(level, run) == "trees"  # what costs more is not lower than the trees
+    assert chosen_of({"svm": svm, "stack": svm - 9}, np.zeros(50)) == "svm"  # one run says nothing
+
+
+def test_without_torch_the_best_is_of_svm_and_trees(monkeypatch):
+    monkeypatch.setattr("terrain.classify.stack.can_fit", lambda: False)
+    X, y, run = draw("features")
+    X[:, :N_FEATURES] = np.random.default_rng(1).uniform(-1, 1, (len(y), N_FEATURES))
+    boxed = np.abs(X[:, :N_FEATURES]) < 0.63  # inside or outside of a box in two of three coordinates
+    y = np.where(boxed[:, :3].sum(axis=1) > 1, "ice", "sand")
+    best = quick(choose=True).fit(X, y, run)
+    assert (best.best_.used, best.best_.loss_cnn, best.network_) == ("trees", None, None)
+    assert np.mean(best.predict(X) == y) > 0.9
+    alone = best.trees_.predict_proba(X[:, :N_FEATURES])
+    assert np.array_equal(best.predict_proba(X), alone)
 
 
 def test_rows_without_features_are_refused():

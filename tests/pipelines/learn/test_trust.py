@@ -1,0 +1,141 @@
+"""Code of one's own is run by a model only where its module was trusted by name."""
+
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.learn.classifier import TerrainClassifier
+from pipelines.learn.model_file import read_files, read_model, seal
+from pipelines.learn.recipes import load_named
+from pipelines.learn.trust import remember, trust_file
+from terrain.errors import ConfigError, ModelError
+
+FIELD = """
+from os import system
+
+import numpy as np
+from pathlib import Path
+from sklearn.neighbors import NearestCentroid
+
+Path("imported").touch()
+
+class Nearest(NearestCentroid):
+    pass
+
+class Peak:
+    __name__ = "peak"
+
+    def __init__(self, channel):
+        self.channel = channel
+
+    def __call__(self, window):
+        return np.abs(window["imu", self.channel]).max()
+
+def roughness(window):
+    return np.abs(np.diff(window["imu", "accel_z_mps2"])).mean()
+"""
+
+
+@pytest.fixture
+def field(tmp_path, monkeypatch):
+    """A module ``field_code`` of the current folder, which leaves a mark when it is imported, and what forgets it."""
+    (tmp_path / "field_code.py").write_text(FIELD, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "configuration"))
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+
+    def forget():
+        sys.modules.pop("field_code", None)
+        (tmp_path / "imported").unlink(missing_ok=True)
+        return tmp_path / "imported"
+
+    yield forget
+    forget()
+
+
+@pytest.fixture
+def saved(field, windows, tmp_path):
+    """A model with an estimator, a function and an object of the module, and its probabilities."""
+    functions = (load_named("field_code:roughness"), load_named("field_code:Peak")("gyro_x_radps"))
+    model = TerrainClassifier(load_named("field_code:Nearest")(), functions=functions).fit(windows)
+    return model.save(tmp_path / "model"), model.predict_proba(windows)
+
+
+def test_nothing_is_imported_until_the_module_is_trusted_and_then_all_is_the_same(field, saved, windows):
+    folder, probability = saved
+    names = ("field_code.Nearest", "field_code.Peak", "field_code.roughness")
+    assert read_files(folder)[0].own_code == names
+    mark = field()
+    with pytest.raises(ModelError) as refusal:
+        TerrainClassifier.load(folder)
+    assert str(refusal.value) == (
+        f"{folder}: it needs code of its own, field_code.Nearest, which is run only where you trust it: "
+        "--trust field_code, once, or trust=('field_code',) in Python"
+    )
+    assert not mark.exists()
+    again = TerrainClassifier.load(folder, trust=["field_code"])
+    assert mark.exists()
+    assert np.array_equal(again.predict_proba(windows), probability)
+    assert len(again.functions) == 2
+    with pytest.raises(ModelError, match="only where you trust it"):
+        read_model(folder)  # an argument is not remembered
+    remember(["field_code"])
+    assert json.loads(trust_file().read_text()) == {"field_code": str(folder.parent / "field_code.py")}
+    assert np.array_equal(read_model(folder).recipe.predict_proba(windows), probability)
+
+
+def test_a_file_of_the_same_name_elsewhere_is_not_the_one_that_was_trusted(field, saved, monkeypatch):
+    folder, _ = saved
+    remember(["field_code.roughness"])
+    mark = field()
+    elsewhere = folder.parent / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "field_code.py").write_text("raise SystemExit('run')", encoding="utf-8")
+    monkeypatch.chdir(elsewhere)
+    monkeypatch.setattr(sys, "path", [each for each in sys.path if each != str(folder.parent)])
+    with pytest.raises(ModelError, match="only where you trust it"):
+        read_model(folder)
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize(
+    ("own", "sentence"),
+    [
+        (("field_code.Nearest", "field_code.Peak"), r"holds field_code\.roughness, a type that models"),
+        (("os.mkdir",), "needs code of its own, os.mkdir, which is run only where you trust"),
+        (("field_code.system",), "field_code.system is none of module field_code"),
+        (("field_code.absent",), "field_code.absent cannot be imported: module 'field_code' has no"),
+        (("field_code",), "field_code cannot be imported"),
+        (("a\nb" * 900,), r"a\\nb.* only where you trust it"),
+    ],
+)
+def test_what_a_stranger_writes_into_the_manifest_runs_nothing_else(field, saved, own, sentence):
+    folder, _ = saved
+    info, _ = read_files(folder)
+    own = own if "field_code.Nearest" in own else (*info.own_code, *own)
+    seal(folder, replace(info, own_code=own))
+    field()
+    with pytest.raises(ModelError, match=sentence) as refusal:
+        read_model(folder, ["field_code", "os"])
+    assert str(refusal.value).isprintable()
+
+
+@pytest.mark.usefixtures("field")
+def test_what_cannot_be_trusted_is_one_sentence():
+    for names, sentence in (
+        (["os"], "module 'os' is not trusted: it is none of your own"),
+        (["sklearn.tree"], "module 'sklearn' is not trusted"),
+        (["../x"], "is not trusted"),
+        (["no_such_module"], "there is no module 'no_such_module' to trust"),
+    ):
+        with pytest.raises(ConfigError, match=sentence):
+            remember(names)
+    assert not trust_file().exists()
+    trust_file().parent.mkdir(parents=True)
+    trust_file().write_text("[3]")
+    with pytest.raises(ConfigError, match="is no table of modules and their files"):
+        remember(["field_code"])
