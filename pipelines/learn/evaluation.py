@@ -177,7 +177,10 @@ def report(result: CrossvalResult) -> Report:
     dataset, curve, drives = result.dataset or "windows", result.learning_curve, result.next_drives
     decide: list[tuple[Any, ...]] = [("always the most frequent terrain", result.chance, PERCENT)]
     if curve is not None:
-        decide += [*result.pairs("speed_only_accuracy", "plain_accuracy"), ("number of runs", curve.statement)]
+        decide += [
+            *result.pairs("speed_only_accuracy", "plain_accuracy"),
+            ("number of runs", curve.statement),
+        ]
     if (found := result.refusals) is not None:
         refused, ends, worst = (
             format_value(each, PERCENT) for each in (found.refused, found.refused_ci, found.worst_run)
