@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -18,6 +19,7 @@ from features.recipes import WindowPipeline, make_recipe
 from features.windows import WindowCut, WindowRule, labelled, overlap_of
 from pipelines.learn.model_file import MANIFEST_FILE, model_info, read_model, write_model
 from pipelines.learn.training_data import with_limits
+from pipelines.live.model import assess
 from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows
@@ -118,7 +120,27 @@ class TerrainClassifier(ClassifierMixin, BaseEstimator):
     def predict_proba(self, X: Windows) -> Array:
         """Return calibrated probabilities (n, k) in the order of ``classes_``; errors as :meth:`predict`."""
         check_is_fitted(self, "model_")
-        return np.asarray(self.model_.recipe.predict_proba(_windows(X)))
+        return assess(self.model_, _windows(X)).probability
+
+    def adapt(self, X: Windows, terrain: str = "") -> Self:
+        """Return the classifier for a session, by some of its windows; ``model_.adaptation.found`` says what was found.
+
+        Parameters
+        ----------
+        X : windows of the session, 5 s of it at least, 20 s are good
+        terrain : that all of them are on; where it is not named, they say less
+
+        Raises
+        ------
+        ConfigError
+            if the terrain was not learned.
+        DataError
+            if the windows are too few or lack a channel, or the training windows had nothing to adapt by.
+        """
+        check_is_fitted(self, "model_")
+        adapted = copy(self)
+        adapted.model_ = self.model_.adapt(_windows(X), terrain)
+        return adapted
 
     def predictions(self, X: Windows) -> pd.DataFrame:
         """Return a row a window: run, start, terrain, and the probability of each terrain."""

@@ -34,6 +34,7 @@ from pipelines.learn.stored_trees import trees_as_arrays, trees_of_arrays
 from pipelines.learn.trust import check_trusted, import_own
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain import __version__
+from terrain.classify.adaptation import Adaptation, check_adaptation
 from terrain.classify.limits import Novelty, SupportTable, check_novelty, check_support
 from terrain.classify.network import check_network, with_centred
 from terrain.errors import ConfigError, DataError, ModelError
@@ -72,6 +73,7 @@ _TRUSTED = {
     "sklearn.multiclass": "_ConstantPredictor",
     "sklearn.neural_network._stochastic_optimizers": "AdamOptimizer SGDOptimizer",
     "sklearn.utils._bunch": "Bunch",
+    "terrain.classify.adaptation": "Adaptation Shift",
     "terrain.classify.grouped": "OwnClassifier Preparation",
     "terrain.classify.limits": "Novelty SupportTable",
     "terrain.classify.network": "Augmentation GroupedNetwork NetworkChoice SampleColumns Trial",
@@ -130,7 +132,8 @@ def write_model(folder: Path, model: TerrainModel) -> Own:
     try:
         if network is not None:
             network.onnx_ = b""  # it lies in a file of its own
-        content, own = packed({"recipe": model.recipe, "novelty": model.novelty, "support": model.support})
+        parts = {name: getattr(model, name) for name in ("recipe", "novelty", "support", "adaptation")}
+        content, own = packed(parts)
     finally:
         if network is not None:
             network.onnx_ = graph
@@ -209,7 +212,7 @@ def read_model(source: str | Path, trust: Iterable[str] = ()) -> TerrainModel:
         info, contents = read_files(folder)
     file = folder / MODEL_FILE
     try:
-        recipe, novelty, support = _unpacked(contents[MODEL_FILE], info.own_code, trust)
+        recipe, novelty, support, adaptation = _unpacked(contents[MODEL_FILE], info.own_code, trust)
         if (network := _network(recipe)) is not None:
             file = folder / ONNX_FILE
             network.onnx_ = with_centred(contents[ONNX_FILE], {}, info.window_s)
@@ -223,6 +226,12 @@ def read_model(source: str | Path, trust: Iterable[str] = ()) -> TerrainModel:
             raise DataError(f"it gives probabilities of the shape {probability.shape}")
         if support is not None:
             check_support(support, info.classes)
+        if adaptation is not None:
+            check_adaptation(adaptation, info.classes)
+            if not set(adaptation.levels) | set(adaptation.wheels) <= {
+                (stream, name) for stream, names in info.channels.items() for name in names
+            }:
+                raise DataError("it adapts by channels that its windows do not have")
         if novelty is not None:
             check_novelty(novelty, len(info.classes))
             n_features = recipe[0].features_of(window).shape[1]
@@ -234,7 +243,7 @@ def read_model(source: str | Path, trust: Iterable[str] = ()) -> TerrainModel:
         raise ModelError(f"{source}: {error}") from error
     except Exception as error:  # skops, numpy and scikit-learn raise whatever a stranger's file leads them to
         raise ModelError(f"{file}: cannot be loaded ({_words(error)})") from error
-    return TerrainModel(recipe, info, novelty, support)
+    return TerrainModel(recipe, info, novelty, support, None, adaptation)
 
 
 @contextmanager
@@ -365,8 +374,8 @@ def _network(recipe: WindowPipeline) -> Any:
 
 def _unpacked(
     content: bytes, own: Own, trust: Iterable[str]
-) -> tuple[WindowPipeline, Novelty | None, SupportTable | None]:
-    """Return recipe, novelty score and support of a model file; ``DataError`` says why it is none."""
+) -> tuple[WindowPipeline, Novelty | None, SupportTable | None, Adaptation | None]:
+    """Return recipe, novelty score, support and adaptation of a model file; ``DataError`` says why it is none."""
     from features.recipes import WindowPipeline
 
     with zipfile.ZipFile(streams.BytesIO(content)) as archive:
@@ -381,15 +390,16 @@ def _unpacked(
     found = skops_io().loads(content, trusted=[*TRUSTED_TYPES, *own])
     trees_of_arrays(found)
     parts = found if isinstance(found, dict) else {"recipe": found}
-    recipe, novelty, support = (parts.get(name) for name in ("recipe", "novelty", "support"))
+    names = ("recipe", "novelty", "support", "adaptation")
+    recipe, novelty, support, adaptation = (parts.get(name) for name in names)
     if not isinstance(recipe, WindowPipeline):
         raise DataError(f"it holds a {type(recipe).__name__}, not a recipe of this package")
     if not hasattr(recipe[0], "layout_"):
         raise DataError("it holds a recipe that was never fitted")
-    for limit, kind in ((novelty, Novelty), (support, SupportTable)):
+    for limit, kind in ((novelty, Novelty), (support, SupportTable), (adaptation, Adaptation)):
         if limit is not None and not isinstance(limit, kind):
             raise DataError(f"it holds a {type(limit).__name__}, {kind.__name__} is read")
-    return recipe, novelty, support
+    return recipe, novelty, support, adaptation
 
 
 def _foreign_types(content: bytes) -> Own:

@@ -54,6 +54,10 @@ class PredictionSettings(TrustSettings):
     filter_stride_s: float | None = setting(None, option="--filter-stride")
     """From window to window in s, as the filter of a live chain has them (0.25)."""
     out: Path | None = setting(None, "File of the predictions: .parquet or .csv.")
+    adapt: str = setting("")
+    """Folder of a drive of the same session, or start (the first 20 s of each session); none switches off what the
+    model does unasked."""
+    adapt_terrain: str = setting("", "The terrain that all of that drive, or of each start, is on.")
 
 
 class ChangesSettings(BaseSettings):
@@ -78,6 +82,10 @@ class Settings(PredictionSettings, ChangesSettings, AlignedRunsSettings):
             )
         if self.out is not None and self.out.suffix not in ENDINGS:
             raise ConfigError(f"--out is {self.out}: a name that ends in {' or '.join(ENDINGS)} is accepted")
+        if self.adapt_terrain and self.adapt in ("", "none"):
+            raise ConfigError(
+                "--adapt-terrain is the terrain of what --adapt names: start, or the folder of a drive"
+            )
         return self
 
 
@@ -137,6 +145,10 @@ class Predictions(Result):
         "as the accuracy, of windows that are not called unknown", "1"
     )
     n_unsupported: int | None = described("windows that no training run supports; None where not counted")
+    adapted: tuple[str, ...] = described("what was found of each session that the model was adapted to")
+    adaptation: str = described(
+        "whether held-out sessions of training show that adapting helps; empty if not used"
+    )
     model: str | None = described("as it was asked for", optional=True)
     dataset: str | None = described("name of the data", optional=True)
     skipped: tuple[str, ...] | None = described("runs that a repairing reader had to skip", optional=True)
@@ -175,6 +187,7 @@ def _changes(settings: Settings, progress: Progress) -> ChangesResult:
 
 
 def _predictions(settings: Settings) -> Predictions:
+    from pipelines.live.model import with_start
     from pipelines.live.windows import filtered
     from terrain.control.slip_table import load_slip_table
     from terrain.robots import load_robot
@@ -183,8 +196,22 @@ def _predictions(settings: Settings) -> Predictions:
     runs, skipped = load(settings)
     robot = None if settings.robot is None else load_robot(settings.robot)
     model = filtered(settings.read_model(settings.model), settings.filter_stride_s)
+    if settings.adapt in ("", "start", "none"):
+        model = with_start(model, settings.adapt, settings.adapt_terrain)
+    else:
+        model = _adapted(model, settings, robot)
     found = predict(runs, model, table, robot=robot, skip_short=settings.repair)
     return replace(found, model=settings.model, dataset=settings.dataset, skipped=tuple(skipped))
+
+
+def _adapted(model: TerrainModel, settings: Settings, robot: Robot | None) -> TerrainModel:
+    """Return a model adapted by a drive, on the terrain that is named; errors as of what reads and adapts."""
+    from features.windows import join_windows
+    from pipelines.live.windows import windows_of_log
+
+    reference, _ = load(settings.with_(data=Path(settings.adapt), only=(), without=()))
+    cuts = [windows_of_log(each, model.info, robot, skip_short=True) for each in reference]
+    return model.adapt(join_windows([cut.windows for cut in cuts]), settings.adapt_terrain)
 
 
 def predict(
@@ -214,7 +241,7 @@ def predict(
     ConfigError
         if the table is for another robot than a run is of.
     """
-    from pipelines.live.model import assess
+    from pipelines.live.model import SessionStart
     from pipelines.live.windows import needs_filter, windows_of_log
     from terrain.logs.run_folders import data_digest
 
@@ -224,11 +251,21 @@ def predict(
                 f"table {table.name} is for robot {table.robot!r}, run {each.run_id} is of {each.robot!r}"
             )
     cuts = [windows_of_log(each, model.info, robot, skip_short=skip_short) for each in runs]
-    parts = [cut.windows for cut in cuts if len(cut.windows)]
-    assessed = [assess(model, part) for part in parts]
+    sessions: dict[str, SessionStart] = {}
+    parts, models, assessed = [], [], []
+    for each, cut in zip(runs, cuts, strict=True):
+        if len(cut.windows):
+            session = sessions.setdefault(each.session or each.run_id, SessionStart(model))
+            parts.append(cut.windows)
+            assessed.append(session.assess(cut.windows))
+            models.append(session.model)
     over_time = _filtered(parts, assessed, model.info)
-    outputs = zip(parts, assessed, over_time, strict=True)
-    rows = [row for of_run in outputs for row in _predict_windows(*of_run, model, table)]
+    outputs = zip(parts, assessed, over_time, models, strict=True)
+    rows = [row for of_run in outputs for row in _predict_windows(*of_run, table)]
+    adapted = []
+    for name, session in sessions.items():
+        if session.model.adaptation is not None and (text := session.model.adaptation.found):
+            adapted.append(text if session.model.adaptation.start is None else f"{name}: {text}")
     classes = model.info.classes
     judged = [row for row in rows if row.label in classes]
     accepted = [row for row in judged if row.terrain == row.nearest]
@@ -264,6 +301,8 @@ def predict(
         accuracy_accepted=right / len(accepted) if accepted else None,
         n_unknown=sum(row.terrain != row.nearest for row in rows),
         n_unsupported=None if model.support is None else sum(row.supported is False for row in rows),
+        adapted=tuple(dict.fromkeys(adapted)),
+        adaptation=model.adaptation.status if model.adaptation and model.adaptation.shift else "",
     )
 
 
@@ -400,6 +439,9 @@ def _notes(result: Predictions) -> list[Part]:
         f"{result.n_unknown} of {result.n_windows} windows are like no terrain that was learned: unknown, for which "
         f"the table's fallback is used; of held-out windows of learned ones {refused} are": result.n_unknown,
         f"counting unknown as wrong, {answered} are right; of what is not unknown, {accepted}": result.n_judged,
+        **dict.fromkeys(result.adapted, True),
+        "adapted to the session, so that a window whose terrain has less than 0.7 is unknown, too; that this helps is "
+        f"{result.adaptation}": result.adaptation,
         f"{result.n_unsupported} predictions are supported by no training run that drove like this": (
             result.n_unsupported
         ),

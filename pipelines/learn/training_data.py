@@ -14,6 +14,7 @@ from features.motion import window_motion
 from features.protocols import Samples, samples_of
 from features.recipes import WindowPipeline, feature_matrix
 from features.windows import Layout
+from pipelines.learn.adaptation import judged_adaptation
 from pipelines.learn.model_file import model_info
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
@@ -143,7 +144,7 @@ def with_limits(
     recipe, info : fitted on the windows, and what is known of it
     samples, features, motion : the windows, their features (n, f), and how the robot moved in each, if known
     """
-    notes, conformal, novelty, support, evidence = [], None, None, None, None
+    notes, conformal, novelty, support, evidence, adaptation = [], None, None, None, None, None
     terrain, dealt = samples.terrain, {"gap": samples.gap, "seed": info.seed}
     try:
         terms = held_out_terms(features, terrain, samples.group, **dealt)
@@ -173,7 +174,13 @@ def with_limits(
     if motion is not None:
         driven = motion.speed_mps, motion.yaw_rate_radps
         support = learn_support(*driven, terrain, samples.run_id, np.unique(terrain).tolist())
-    return TerrainModel(recipe, info, novelty, support), tuple(notes)
+    try:
+        adaptation = judged_adaptation(
+            samples.windows, features, recipe[0].features_of, samples.gap, info.seed
+        )
+    except DataError as error:
+        notes.append(f"no adapting to a session: {error}")
+    return TerrainModel(recipe, info, novelty, support, None, adaptation), tuple(notes)
 
 
 def _errors_taken_over(classifier: Any, info: ModelInfo, samples: Samples) -> tuple[TakenOver, ...]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from features.stream import WindowFeed
-from pipelines.live.model import TerrainModel, assess
+from pipelines.live.model import SessionStart, TerrainModel, assess
 from pipelines.live.windows import feed_of
 from terrain.classify.terrain_filter import LiveTerrainFilter
 from terrain.control.switching import UNKNOWN, TerrainEstimate, TerrainSource
@@ -84,9 +84,9 @@ def classify_window(model: TerrainModel, window: Windows) -> WindowOutput:
 
 
 class _Part(NamedTuple):
-    """A model, and what cuts its windows."""
+    """What classifies the windows of a session, and what cuts them."""
 
-    model: TerrainModel
+    session: SessionStart
     feed: WindowFeed
 
 
@@ -106,6 +106,7 @@ class Classifier(TerrainSource):
     Attributes
     ----------
     failed : number of windows that the model refused, by error message
+    adapted : what the start of the session shifted, in a sentence; empty before and without
 
     Notes
     -----
@@ -130,6 +131,7 @@ class Classifier(TerrainSource):
         self._finished: deque[WindowOutput] = deque()
         self._part: _Part | None = None  # that is worked with
         self._over_time: LiveTerrainFilter | None = None
+        self.adapted = ""
         self._due_s = math.inf
         self._counts: Mapping[str, int] = {}
         self._lost: Counter[str] = Counter()
@@ -167,7 +169,8 @@ class Classifier(TerrainSource):
         """Cut windows anew from the next sample on; the belief of the terrain filter goes on."""
         if self.model is not None:
             over_time = self._over_time
-            self._begin(self.model, self._feed_of(self.model))
+            session = None if self._part is None or not self._part.session.over else self._part.session
+            self._begin(self.model, self._feed_of(self.model), session)
             if over_time is not None:
                 over_time.restart(self.model.info.window_s)
                 self._over_time = over_time
@@ -181,12 +184,12 @@ class Classifier(TerrainSource):
             return self._feed
         return self._feed_of(model)
 
-    def _begin(self, model: TerrainModel, feed: WindowFeed) -> None:
+    def _begin(self, model: TerrainModel, feed: WindowFeed, session: SessionStart | None = None) -> None:
         self.model, self._feed = model, feed
         self._over_time = None if model.over_time is None else LiveTerrainFilter(model.over_time)
         self.settled = self._over_time is not None
         self._due_s = math.inf
-        self._waiting.append(_Part(model, feed))
+        self._waiting.append(_Part(session or SessionStart(model), feed))
         self._do_what_waits()
 
     def _do_what_waits(self) -> None:
@@ -235,7 +238,9 @@ class Classifier(TerrainSource):
                     self._part = taken
                 elif self._part is not None:
                     for window in self._part.feed.push(*taken):
-                        self._finished.append(classify_window(self._part.model, window))
+                        model = self._part.session.take(window)
+                        self._finished.append(classify_window(model, window))
+                        self.adapted = "" if model.adaptation is None else model.adaptation.found
         finally:
             if self._part is not None:
                 due_s = self._part.feed.due_s  # minus infinity before all streams have begun

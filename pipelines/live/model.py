@@ -9,18 +9,30 @@ terrain like this (:mod:`terrain.classify.limits`).  Of windows of known terrain
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from features.motion import window_motion
-from features.windows import Layout, SteadyMotion, WindowRule
+from features.windows import Layout, SteadyMotion, WindowRule, join_windows
 from pipelines.report.results import described
-from terrain.classify.limits import SUPPORTED, Novelty, SupportTable, conformal_sets, supported_probability
+from terrain.classify.adaptation import CERTAIN, Adaptation, adapt, corrected, corrections, start_of
+from terrain.classify.limits import (
+    LEVEL,
+    SUPPORTED,
+    Novelty,
+    SupportTable,
+    conformal_sets,
+    supported_probability,
+)
 from terrain.classify.proposals import TakenOver
 from terrain.classify.terrain_filter import NOVELTY_WEIGHTS, SHARE_POWERS, FilterSettings
+from terrain.errors import DataError
 from terrain.records import Array, Windows
+
+NOTHING_TO_ADAPT = "the model knows no levels of currents or vibration that it could adapt by: train it anew"
 
 
 @dataclass(frozen=True)
@@ -87,7 +99,8 @@ class TerrainModel(NamedTuple):
 
     ``recipe`` has ``predict_proba(windows)``, ``classes_`` and ``matrix`` of features.  ``novelty`` and ``support``
     are None of training runs that give none; ``over_time`` are the settings of the filter of its outputs, where they
-    are to be filtered.
+    are to be filtered; ``adaptation`` is what was learned of sessions, and the shift of the
+    present one.
     """
 
     recipe: Any
@@ -95,6 +108,85 @@ class TerrainModel(NamedTuple):
     novelty: Novelty | None = None
     support: SupportTable | None = None
     over_time: FilterSettings | None = None
+    adaptation: Adaptation | None = None
+
+    def adapt(self, windows: Windows, terrain: str = "") -> TerrainModel:
+        """Return the model for a session, of which there are some windows: all on one terrain, or on what is not known.
+
+        Raises
+        ------
+        ConfigError
+            if the terrain was not learned.
+        DataError
+            if the windows are too few or lack a channel, or the model has nothing to adapt by.
+        """
+        if self.adaptation is None:
+            raise DataError(NOTHING_TO_ADAPT)
+        return self._replace(adaptation=adapt(self.adaptation, windows, terrain))
+
+    def at_start(self, terrain: str = "") -> TerrainModel:
+        """Return the model as a session begins with it: its first 20 s adapt it, on a terrain or none that is known.
+
+        Errors as :meth:`adapt`.
+        """
+        if self.adaptation is None:
+            raise DataError(NOTHING_TO_ADAPT)
+        return self._replace(adaptation=self.adaptation.of_start(terrain))
+
+
+class SessionStart:
+    """The model for the windows of one session, in order of time: adapted by those of its start.
+
+    Attributes
+    ----------
+    model : for windows from now on; that of the service where it takes no start
+
+    Notes
+    -----
+    A start of too few windows leaves what a session begins with.
+    """
+
+    def __init__(self, model: TerrainModel) -> None:
+        self.model = model
+        self._kept: list[Windows] | None = []
+        if model.adaptation is None or model.adaptation.start is None:
+            self._kept = None
+
+    @property
+    def over(self) -> bool:
+        """Whether no window is waited for any longer."""
+        return self._kept is None
+
+    def assess(self, windows: Windows) -> Assessed:
+        """Return what :func:`assess` says of windows that follow those taken before."""
+        if self._kept is None or not len(windows):
+            return assess(self.model, windows)
+        start = start_of(join_windows([*self._kept, windows]))[-len(windows) :]
+        parts = [assess(self.take(each), each) for each in (windows[start], windows[~start]) if len(each)]
+        return Assessed(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+    def take(self, windows: Windows) -> TerrainModel:
+        """Return the model for windows that follow those taken before, all within or all after the start."""
+        if self._kept is None or not len(windows):
+            return self.model
+        kept, self._kept = [*self._kept, windows], None
+        if start_of(join_windows(kept))[-1]:
+            self._kept = kept
+        elif len(kept) > 1:
+            assert self.model.adaptation is not None
+            with suppress(DataError):  # too few windows
+                terrain = self.model.adaptation.start or ""
+                self.model = self.model.adapt(join_windows(kept[:-1]), terrain)
+        return self.model
+
+
+def with_start(model: TerrainModel, adapt: str, terrain: str) -> TerrainModel:
+    """Return a model as sessions begin with it: adapted by their ``start``, by ``none``, or ("") where that is shown.
+
+    Errors as :meth:`TerrainModel.at_start`.
+    """
+    unasked = not adapt and model.adaptation is not None and model.adaptation.shown
+    return model.at_start(terrain) if adapt == "start" or unasked else model
 
 
 class Assessed(NamedTuple):
@@ -115,8 +207,31 @@ def assess(model: TerrainModel, windows: Windows) -> Assessed:
     DataError
         if the windows are not those that the model requires.
     """
-    novelty = supported = np.full(len(windows), np.nan)
-    features, recipe = None, model.recipe
+    supported = np.full(len(windows), np.nan)
+    probability, novelty = _outputs(model, windows)
+    unknown = np.zeros(len(windows), dtype=bool)
+    if model.novelty is not None:
+        unknown = ~(novelty <= model.novelty.threshold)
+    if model.adaptation is not None and model.adaptation.shift is not None:
+        unknown |= ~(probability.max(axis=1) >= CERTAIN)
+    if model.support is not None and (motion := window_motion(windows)) is not None:
+        near = model.support.near_runs(motion.speed_mps, motion.yaw_rate_radps)
+        supported = (supported_probability(probability, near) >= SUPPORTED).astype(float)
+    return Assessed(probability, novelty, unknown, supported)
+
+
+def _outputs(model: TerrainModel, windows: Windows) -> tuple[Array, Array]:
+    """Return probabilities (n, k) and the score of novelty (n,), NaN without one.
+
+    Of an adapted model, probabilities are averages over the corrections that are possible, and novelty is that of the
+    window as the most likely correction for its most probable terrain has it.
+    """
+    recipe, n, of_terrain = model.recipe, len(windows), None
+    if model.adaptation is not None and model.adaptation.shift is not None:
+        values, weights = zip(*corrections(model.adaptation), strict=True)
+        windows = join_windows([corrected(model.adaptation, windows, theta) for theta in values])
+        of_terrain = np.array(weights)
+    features = novelty = None
     if model.novelty is not None:
         features = recipe[0].features_of(windows)
         novelty = model.novelty.score(features)
@@ -124,17 +239,20 @@ def assess(model: TerrainModel, windows: Windows) -> Assessed:
     probability = np.asarray(
         recipe.predict_proba(windows) if from_features is None else from_features(windows, features)
     )
-    unknown = np.zeros(len(windows), dtype=bool)
-    if model.novelty is not None:
-        unknown = ~(novelty <= model.novelty.threshold)
-    if model.support is not None and (motion := window_motion(windows)) is not None:
-        near = model.support.near_runs(motion.speed_mps, motion.yaw_rate_radps)
-        supported = (supported_probability(probability, near) >= SUPPORTED).astype(float)
-    return Assessed(probability, novelty, unknown, supported)
+    if of_terrain is not None:
+        probability = np.einsum("ink,ik->nk", probability.reshape(-1, n, probability.shape[1]), of_terrain)
+        probability /= probability.sum(axis=1, keepdims=True)
+        first = (of_terrain > 0.0).argmax(axis=0)  # of each terrain's corrections
+        if novelty is not None:
+            novelty = novelty.reshape(-1, n)[first[probability.argmax(axis=1)], np.arange(n)]
+    return probability, np.full(n, np.nan) if novelty is None else novelty
 
 
 def class_sets(model: TerrainModel, probability: Array) -> list[tuple[str, ...]] | None:
     """Return the classes of each window that hold the true one in 90 % of windows; None if not calibrated.
+
+    Of an adapted model they are the most probable ones that have 90 % together: its probabilities hold what of the
+    session is not known, which the threshold of training does not.
 
     Parameters
     ----------
@@ -144,4 +262,9 @@ def class_sets(model: TerrainModel, probability: Array) -> list[tuple[str, ...]]
     if model.info.conformal is None:
         return None
     classes = np.asarray(model.info.classes)
+    if model.adaptation is not None and model.adaptation.shift is not None:
+        order = np.argsort(-probability, axis=1)
+        before = np.cumsum(np.take_along_axis(probability, order, axis=1), axis=1)
+        n_needed = (before < LEVEL).sum(axis=1) + 1
+        return [tuple(classes[np.sort(each[:n])].tolist()) for each, n in zip(order, n_needed, strict=True)]
     return [tuple(classes[row].tolist()) for row in conformal_sets(probability, model.info.conformal)]

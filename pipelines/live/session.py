@@ -85,6 +85,7 @@ class Hello(BaseModel):
     follows : whether they drive the wheels; not where another controller does and these are only watched
     rate_hz : of the answers; 0 asks for one at each message with ``"step": true``
     record : whether the session is recorded
+    start : terrain that its first 20 s are on, which adapt the model to the session
     """
 
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -101,6 +102,7 @@ class Hello(BaseModel):
     follows: bool = True
     rate_hz: Annotated[float, Field(ge=0.0, le=200.0, strict=False)] = 10.0
     record: bool = False
+    start: Annotated[str, StringConstraints(max_length=64)] = ""
 
     @field_validator("streams")
     @classmethod
@@ -142,9 +144,11 @@ class RobotSession:
     Raises
     ------
     ConfigError
-        if commands are asked for a robot that has no pilot, or the table is another robot's.
+        if commands are asked for a robot that has no pilot, the table is another robot's, or the terrain of its
+        start was not learned.
     DataError
-        if the model needs channels that the robot does not send, or there is neither model nor pilot.
+        if the model needs channels that the robot does not send, there is neither model nor pilot, or the model has
+        nothing to adapt by.
     """
 
     def __init__(
@@ -162,7 +166,7 @@ class RobotSession:
             raise ConfigError(
                 f"robot {hello.robot!r} has no description here: commands cannot be given to it"
             )
-        self.chain = chain_of(robot, hello.streams, served.model, served.table, pilot, thread)
+        self.chain = chain_of(robot, hello.streams, self._model_of(served), served.table, pilot, thread)
         self._wheels = () if robot is None else robot.wheels
         self._clock = SessionClock()
         self._twist, self._twist_s = _NO_TWIST, -math.inf
@@ -216,8 +220,14 @@ class RobotSession:
             "terrain": self.chain.belief.terrain or None,
             "recording": self.recording,
             "late": self.late or None,
+            "adapted": self.adapted or None,
             "dropped": self.dropped,
         }
+
+    @property
+    def adapted(self) -> str:
+        """What the start of the session shifted, in a sentence; empty before and without."""
+        return str(getattr(self.chain.source, "adapted", ""))
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -236,8 +246,14 @@ class RobotSession:
 
     def swap(self, served: Served) -> None:
         """Go on with another model and table, between two steps; no sample is lost, what is raised changes nothing."""
-        self.chain.replace(served.model, served.table)
+        self.chain.replace(self._model_of(served), served.table)
         self.served = served
+
+    def _model_of(self, served: Served) -> TerrainModel | None:
+        """Return the model of the service, to be adapted by a start on the terrain that the robot named."""
+        if not self.hello.start or served.model is None:
+            return served.model
+        return served.model.at_start(self.hello.start)
 
     def put(self, streams: Any, twist: Any, now_s: float) -> int:
         """Take the samples of a message; return how many rows of it were taken.

@@ -48,6 +48,10 @@ class ServedSettings(TrustSettings):
     table: Path | None = setting(None, "Table of target slips; the packaged one by default.")
     filter_stride_s: float | None = setting(None, option="--filter-stride")
     """Windows so far apart in s (0.25), filtered over time; as trained otherwise."""
+    adapt: Literal["", "start", "none"] = setting("")
+    """start: the first 20 s of each session adapt the model to it; none: never; by default where training shows that
+    it helps."""
+    adapt_terrain: str = setting("", "The terrain that each start is on, where it is known.")
     robot: str | None = setting(None)
     """Robot by name, or its YAML file: its description is used for robots of its name."""
     rate_hz: float = setting(50.0, option="--rate", ge=1.0, le=1000.0)
@@ -58,9 +62,11 @@ def loaded(settings: ServedSettings, name: str | None) -> TerrainModel | None:
     """Return a model by its name, filtered over time where the settings have it so; None without a name."""
     if name is None:
         return None
+    from pipelines.live.model import with_start
     from pipelines.live.windows import filtered
 
-    return filtered(settings.read_model(name), settings.filter_stride_s)
+    model = filtered(settings.read_model(name), settings.filter_stride_s)
+    return with_start(model, settings.adapt, settings.adapt_terrain)
 
 
 class ServiceSettings(BaseSettings):
@@ -110,6 +116,8 @@ class Settings(ReplaySettings, CanSettings, ServiceSettings, ServedSettings):
         mode = asked[0] if asked else "the WebSocket service"
         modes["the WebSocket service"] = ServiceSettings
         self.refuse_others(mode, modes, "is an option of {of}, not of {mode}")
+        if self.adapt_terrain and self.adapt != "start":
+            raise ConfigError("--adapt-terrain is the terrain of each start: --adapt start is required")
         return self
 
 

@@ -79,7 +79,7 @@ def window(start_s):
 def stub_model(name):
     """A model of a name that cuts any windows."""
     info = SimpleNamespace(classes=("a",), channels={}, rate_hz={}, least_rate_hz={}, rule=name, filter="")
-    return SimpleNamespace(info=info, over_time=None)
+    return SimpleNamespace(info=info, over_time=None, adaptation=None)
 
 
 @pytest.fixture
