@@ -314,11 +314,12 @@ class LiveTerrainFilter:
         """Return the class after a window, and its probability; -1 and NaN where none is certain enough.
 
         Probabilities that are NaN let the belief widen; a window that does not end after the last is no
-        evidence.
+        evidence, but the next one is.
         """
-        dt_s = 0.0 if math.isnan(self._end_s) else end_s - self._end_s
-        if dt_s > 0.0 or math.isnan(self._end_s):
-            self._end_s = end_s
+        first, dt_s = math.isnan(self._end_s), end_s - self._end_s
+        self._end_s = end_s  # also where it goes back, so that a clock that was set does not stop the filter
+        if first or dt_s > 0.0:
+            dt_s = 0.0 if first else dt_s
             evidence = float(novelty_evidence(np.array([novelty]), np.array([unknown]))[0])
             self._belief = filter_step(self._belief, probability, dt_s, self._settings, evidence)
         belief = self._belief.probability
