@@ -124,10 +124,10 @@ def test_belief_goes_on_through_a_session_as_over_a_gap_and_begins_anew_in_anoth
 
 def test_a_clock_that_goes_back_costs_one_window():
     live = LiveTerrainFilter(THREE)
-    sure = np.eye(3) * 0.85 + 0.05
-    assert [live.take(1000.0 + k, sure[0])[0] for k in range(4)] == [0] * 4
-    assert live.take(1.0, sure[1])[0] == 0
-    assert [live.take(2.0 + k, sure[1])[0] for k in range(4)][-1] == 1
+    certain = np.eye(3) * 0.85 + 0.05
+    assert [live.take(1000.0 + k, certain[0])[0] for k in range(4)] == [0] * 4
+    assert live.take(1.0, certain[1])[0] == 0
+    assert [live.take(2.0 + k, certain[1])[0] for k in range(4)][-1] == 1
 
 
 def held_out(seed, n_runs=12, n=20, right=0.6, shares=(1.0, 1.0, 1.0)):
