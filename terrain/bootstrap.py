@@ -10,7 +10,7 @@ The American Statistician 69, 371, 4.2).
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import ndtr, stdtrit
+from scipy.special import betaincinv, ndtr, stdtrit
 
 from terrain.records import Array
 
@@ -83,3 +83,19 @@ def percentile_interval(draws: Array, level: float = LEVEL, freedom: float = np.
     below = ndtr(-stdtrit(freedom, (1 + level) / 2)) if np.isfinite(freedom) else (1 - level) / 2
     low, high = np.nanquantile(draws, [below, 1 - below])
     return float(low), float(high)
+
+
+def proportion_interval(k: float, n: float, level: float = LEVEL) -> tuple[float, float]:
+    """Return the interval of a proportion of which k of n units are; both may be fractions, of units that are in part.
+
+    Source: Clopper and Pearson, Biometrika 26 (1934).
+
+    Examples
+    --------
+    >>> [round(end, 3) for end in proportion_interval(0, 59, 0.9)]
+    [0.0, 0.05]
+    """
+    if not k >= 0.0:
+        return np.nan, np.nan
+    below = betaincinv(k, n - k + 1, (1 - level) / 2) if k > 0 else 0.0
+    return float(below), float(betaincinv(k + 1, n - k, (1 + level) / 2)) if k < n else 1.0

@@ -13,7 +13,7 @@ from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.tree import Column, Report, Table, Text, sections
 from terrain.records import RunLog
 from terrain.robots import load_robot
-from terrain.slip_learning.ground_changes import WatchedRun, quiet_detector, watch
+from terrain.slip_learning.ground_changes import MAX_DELAY_S, WatchedRun, quiet_detector, watch
 from terrain.slip_learning.measured import one_robot
 
 MAX_ROWS = 12
@@ -25,11 +25,16 @@ class ChangesResult(Result):
     robot: str = described("robot by name")
     n_calibration_runs: int = described("runs on one ground that the detector was calibrated with")
     threshold: float = described("of the detector")
-    false_alarm_ratio: float = described("calibration runs with an alarm", "1")
+    false_alarm_ratio: float = described(
+        "calibration runs with an alarm when held out of the calibration", "1"
+    )
+    false_alarm_interval: tuple[float, float] = described("of that, 95 % over runs or sessions", "1")
+    false_alarms_a_minute: float = described("the same in the time of these runs", "1/min")
     runs: tuple[WatchedRun, ...] = described("what was found in each run")
     n_steps: int = described("runs whose slip changes, as measured from outside")
     found_ratio: float = described("those among them whose change was found", "1")
-    delay_median_s: float = described("of the alarms behind the middle of the crossing", "s")
+    n_early: int = described("alarms before the change in runs that have one, which are false")
+    delay_median_s: float = described("of the alarms behind the change", "s")
     delay_p90_s: float = described("nine tenths of the delays are below", "s")
     n_without_step: int = described("runs without such a change")
     n_alarms_without_step: int = described("those among them with an alarm")
@@ -54,7 +59,7 @@ def find_changes(
     runs : to watch
     quiet : on one ground each
     robot : name or YAML file; that of the runs by default
-    false_alarms : part of the quiet runs that may give an alarm
+    false_alarms : probability of an alarm in a run on one ground
     progress : called as runs are watched
 
     Raises
@@ -76,6 +81,7 @@ def find_changes(
         runs=tuple(watched),
         n_steps=len(with_step),
         found_ratio=float(np.mean([run.found for run in with_step])) if with_step else float("nan"),
+        n_early=sum(run.n_early for run in with_step),
         delay_median_s=float(np.median(delays)) if delays.size else float("nan"),
         delay_p90_s=float(np.quantile(delays, 0.9)) if delays.size else float("nan"),
         n_without_step=len(without),
@@ -92,13 +98,14 @@ def report(result: ChangesResult) -> Report:
         steps, found = plural(result.n_steps, "change"), format_value(result.found_ratio, ".1%")
         answer += f"; of {steps} that a measurement from outside shows, {found} found"
         notes.append(
-            f"alarms come {format_value(result.delay_median_s, '+.2f', 's')} after the middle of the crossing in "
-            f"the median, {format_value(result.delay_p90_s, '+.2f', 's')} at nine tenths"
+            f"alarms come {format_value(result.delay_median_s, '+.2f', 's')} after the change in the median, "
+            f"{format_value(result.delay_p90_s, '+.2f', 's')} at nine tenths; a change is found where one comes at "
+            f"most {MAX_DELAY_S:g} s after it; {plural(result.n_early, 'alarm')} before it are false"
         )
     if result.n_without_step:
         notes.append(
-            f"slip does not change in {result.n_without_step} runs; {result.n_alarms_without_step} of them "
-            "have an alarm"
+            f"slip does not change clearly in {result.n_without_step} runs; {result.n_alarms_without_step} of them "
+            "have an alarm: false, unless single wheels changed the ground"
         )
     columns = (
         Column("run", of="run_id"),
@@ -115,8 +122,10 @@ def report(result: ChangesResult) -> Report:
         title=f"Changes of the ground under {result.robot}",
         answer=f"{answer}.",
         lead=(
-            f"threshold {format_value(result.threshold, '.1f')}, exceeded in "
-            f"{format_value(result.false_alarm_ratio, '.1%')} of {result.n_calibration_runs} runs on one ground"
+            f"threshold {format_value(result.threshold, '.1f')}; of {result.n_calibration_runs} runs on one ground "
+            f"{format_value(result.false_alarm_ratio, '.1%')} have an alarm when held out of the calibration "
+            f"({format_value(result.false_alarm_interval, '.1%')}, 95 %; "
+            f"{format_value(result.false_alarms_a_minute, '.2f')} a minute)"
         ),
         parts=[
             Table(columns, result.runs[:MAX_ROWS], note=more),

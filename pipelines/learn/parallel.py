@@ -306,7 +306,8 @@ def _failures(client: Any) -> Iterator[None]:
         ) from error
     except (CancelledError, CommClosedError, ConnectionError, TimeoutError) as error:
         raise TerrainError(
-            f"the Dask scheduler at {address} does not answer any more; what was computed is lost"
+            f"the Dask scheduler at {address} does not answer any more: what was not written yet is lost; features in "
+            "--cache and trials of --search are kept, and the same command goes on with them"
         ) from error
     except MemoryError as error:
         raise TerrainError(f"a worker of {address} has too little memory for its task") from error

@@ -21,19 +21,22 @@ where the ground does; with the covariance S of a block's mean on one ground, n 
 
 grows with every block after a change (Basseville and Nikiforov, Detection of Abrupt Changes, 1993, 2.4.3, for
 a change of unknown size; here the mean before it is unknown too).  It is an alarm above a threshold, and the
-most likely j is the change; from there on everything begins anew.  The threshold is what runs on one ground each exceed
-in a given share of the runs.  No label is needed, and none is given: what the ground changed to is for the classifier.
+most likely j is the change; from there on everything begins anew.  The threshold is what a run on one ground exceeds
+with a given probability, and how often runs that were held out do so is measured.  No label is needed, and none is
+given: what the ground changed to is for the classifier.
 A change of regime (speed or direction of the wheels) also begins anew, since responses then change on any ground; a
 standing robot answers nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from terrain.bootstrap import proportion_interval
 from terrain.errors import DataError
 from terrain.records import Array, Windows
 
@@ -68,6 +71,7 @@ MAX_REGIME_CHANGE = 0.15
 MIN_SPEED_RATIO = 0.5  #: Of the regime's speed; slower, the robot stops.
 #: Share of the runs on one ground in which the threshold is exceeded, unless another is given.
 FALSE_ALARM_RATIO = 0.02
+N_FOLDS = 5  #: Parts of the runs that are held out of the calibration in turn
 
 
 def change_points(values: Array) -> list[tuple[int, int, float]]:
@@ -162,13 +166,16 @@ def breakaways(held_out: HeldOut, windows: Windows) -> tuple[Breakaway, ...]:
 class DetectorSettings(NamedTuple):
     """What runs on one ground each show: the covariance (r, r) of a block's mean, and the threshold.
 
-    ``n_runs`` is how many they were, ``false_alarm_ratio`` how many of them exceed the threshold.
+    ``n_runs`` is how many they were; ``false_alarm_ratio``, with its 95 % interval over units, how many of them give an
+    alarm when they are held out of the calibration, NaN where none can be, and ``false_alarms_a_minute`` in what time.
     """
 
     covariance: Array
     threshold: float
     n_runs: int
     false_alarm_ratio: float
+    false_alarm_interval: tuple[float, float] = (math.nan, math.nan)
+    false_alarms_a_minute: float = math.nan
 
 
 class GroundChange(NamedTuple):
@@ -257,25 +264,60 @@ def changes_of(
 
 
 def calibrate(
-    logs: Iterable[tuple[Array, Array, Array]], false_alarm_ratio: float = FALSE_ALARM_RATIO
+    logs: Iterable[tuple[Array, Array, Array]],
+    false_alarm_ratio: float = FALSE_ALARM_RATIO,
+    units: Sequence[str] | None = None,
 ) -> DetectorSettings:
     """Return the settings with which runs on one ground each give an alarm in a given share of them.
 
-    ``logs`` are as :func:`changes_of` takes them; ``DataError`` where none is long enough.
+    The threshold is the order statistic that a further run exceeds with that probability or a smaller one, where the
+    runs suffice for one (Vovk et al. 2005); of fewer it is the largest.  The share that is stated is that of runs that
+    were held out of the calibration, a fifth of the units at a time.
+
+    Parameters
+    ----------
+    logs : as :func:`changes_of` takes them; ``DataError`` where none is long enough
+    false_alarm_ratio : probability of an alarm in a run
+    units : session or run of each log, which are held out whole; each log by default
     """
-    runs = []
-    for log in logs:
-        found = list(_ratios(blocks_of(*log), np.eye(log[1].shape[1]), np.inf))
+    runs, unit = [], []
+    for number, log in enumerate(logs):
+        blocks = list(blocks_of(*log))
+        found = list(_ratios(blocks, np.eye(log[1].shape[1]), np.inf))
         if found and len(found[-1][2]) >= 2 * MIN_BLOCKS:  # of one regime, settled, with all responses
-            runs.append(found[-1][2])
+            settled = np.array([each.responses for each in found[-1][2]])
+            runs.append((blocks, settled - settled.mean(axis=0)))
+            unit.append(str(number) if units is None else units[number])
     if not runs:
         raise DataError(
             f"no run is driven steadily for {2 * MIN_BLOCKS * BLOCK_S + SETTLING_S:g} s, as a threshold takes"
         )
-    values = [np.array([each.responses for each in blocks]) for blocks in runs]
-    apart = np.concatenate([part - part.mean(axis=0) for part in values])
-    covariance = apart.T @ apart / max(len(apart) - len(values), 1)
+    names, place = np.unique(unit, return_inverse=True)
+    held_out = np.full(len(runs), np.nan)
+    for fold in range(N_FOLDS if len(names) > 1 else 0):
+        test = np.flatnonzero(place % N_FOLDS == fold)
+        train = np.flatnonzero(place % N_FOLDS != fold)
+        if len(test) and len(train):
+            covariance, threshold = _fitted([runs[i] for i in train], false_alarm_ratio)
+            held_out[test] = [_largest(runs[i][0], covariance) > threshold for i in test]
+    of_unit = np.bincount(place, held_out) / np.bincount(place)
+    minutes = sum(len(blocks) for blocks, _ in runs) * BLOCK_S / 60.0
+    ends = proportion_interval(float(of_unit.sum()), len(names))
+    settings = _fitted(runs, false_alarm_ratio)
+    return DetectorSettings(
+        *settings, len(runs), float(of_unit.mean()), ends, float(held_out.sum() / minutes)
+    )
+
+
+def _fitted(runs: Sequence[tuple[list[Block], Array]], false_alarm_ratio: float) -> tuple[Array, float]:
+    """Return the covariance of a block's mean, and the threshold, of blocks and settled deviations of runs."""
+    apart = np.concatenate([each for _, each in runs])
+    covariance = apart.T @ apart / max(len(apart) - len(runs), 1)
     covariance += np.eye(len(covariance)) * 1e-9 * max(float(np.trace(covariance)), 1e-12)
-    largest = np.array([max(ratio for ratio, *_ in _ratios(each, covariance, np.inf)) for each in runs])
-    threshold = float(np.quantile(largest, 1.0 - false_alarm_ratio))
-    return DetectorSettings(covariance, threshold, len(runs), float(np.mean(largest > threshold)))
+    largest = np.sort([_largest(blocks, covariance) for blocks, _ in runs])
+    rank = math.ceil((len(runs) + 1) * (1.0 - false_alarm_ratio) - 1e-9)
+    return covariance, float(largest[min(rank, len(runs)) - 1])
+
+
+def _largest(blocks: Sequence[Block], covariance: Array) -> float:
+    return max(ratio for ratio, *_ in _ratios(blocks, covariance, np.inf))

@@ -24,9 +24,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import betaincinv
 
-from terrain.bootstrap import LEVEL
+from terrain.bootstrap import LEVEL, proportion_interval
 from terrain.classify.folds import single_run_classes
 from terrain.classify.terrain_filter import DWELL_S, OUTLIER_RATIO
 from terrain.errors import ConfigError
@@ -180,7 +179,7 @@ def held_out_errors(
         if not time.sum():
             break
         ratio, n = bad.sum() / time.sum(), time.sum() ** 2 / (time**2).sum()
-        upper = float(betaincinv(n * ratio + 1, n - n * ratio, LEVEL)) if ratio < 1 else 1.0
+        _, upper = proportion_interval(n * ratio, n, 2 * LEVEL - 1)
         taken = float(time.sum() / size.sum())
         found.append(TakenOver(least, taken, float(ratio), upper, int((time > 0).sum()), terrains))
     return tuple(found)

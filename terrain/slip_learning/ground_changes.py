@@ -2,8 +2,8 @@
 
 Measured from outside, the instant at which the slip of a run changes is that at which it drives onto other ground.
 Slip over short windows is fitted by two levels, one before an instant and one after it, least squares over
-all instants.  A robot crosses a border wheel by wheel, so that its slip changes over the time in which it
-travels the distance of its wheels; the instant is the middle of that.
+all instants.  A robot crosses a border wheel by wheel; the instant is the middle of that.  A change is found by an
+alarm from that instant on, as far as it is known, up to :data:`MAX_DELAY_S` later; an earlier one is false.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ from terrain.robots import Robot
 from terrain.slip_learning.measured import measured_slip, outside_source, wheel_speeds
 
 WINDOW_S, STRIDE_S = 0.5, 0.1
+MAX_DELAY_S = (
+    3.0  #: Later alarms are none of the change: three blocks before one, and the crossing's second half
+)
 
 SETTLING_S = 0.4  #: Windows that begin earlier have the start in them
 MIN_WINDOWS = 5  #: On each side of the instant
@@ -31,12 +34,11 @@ one ground, and clearer than its noise over 0.5 s."""
 
 
 class SlipStep(NamedTuple):
-    """A change of slip: its instant, the slip before and after, and the time it takes the robot to cross."""
+    """A change of slip: its instant, known to half a window, and the slip before and after."""
 
     time_s: float
     before: float
     after: float
-    crossing_s: float
 
 
 def slip_step(run: RunLog, robot: Robot) -> SlipStep | None:
@@ -55,9 +57,7 @@ def slip_step(run: RunLog, robot: Robot) -> SlipStep | None:
     scatter = float(np.sqrt(np.mean((slip - np.where(np.arange(n) < j, one, other)) ** 2)))
     if abs(other - one) < max(MIN_STEP, MIN_CLEAR * scatter):
         return None
-    speed_mps = float(np.median(np.linalg.norm(found.twist[known, :2], axis=1)))
-    extent_m = 2.0 * float(np.linalg.norm(robot.wheel_positions_m, axis=1).max())
-    return SlipStep(float(time_s[j - 1] + time_s[j]) / 2, one, other, extent_m / max(speed_mps, 1e-3))
+    return SlipStep(float(time_s[j - 1] + time_s[j]) / 2, one, other)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,10 +69,10 @@ class WatchedRun:
     judged: bool  #: whether the motion was measured from outside
     #: of the slip measured from outside; None where it does not change, or nothing measured it
     step: SlipStep | None
-    #: whether an alarm came while the robot crossed the border, or as long after; None without a step
+    #: whether an alarm came after the change, and at most :data:`MAX_DELAY_S`; None without a step
     found: bool | None
-    delay_s: float  #: of that alarm behind the middle of the crossing; NaN without one
-    n_early: int  #: alarms before the crossing; all of them where the slip does not change
+    delay_s: float  #: of that alarm behind the change; NaN without one
+    n_early: int  #: alarms before the change, which are false; all of them where the slip does not change
 
 
 def quiet_detector(
@@ -85,7 +85,7 @@ def quiet_detector(
     quiet : on one ground each
     runs : that are to be watched, none of which may be among them
     robot : of all of them
-    false_alarms : part of the quiet runs that may give an alarm
+    false_alarms : probability of an alarm in a run on one ground
 
     Raises
     ------
@@ -99,7 +99,9 @@ def quiet_detector(
     shared = [run.run_id for run in runs if run.run_id in known]
     if shared:
         raise DataError(f"run {shared[0]} is watched and calibrated on; one or the other is needed")
-    return calibrate((response_log(run, robot) for run in quiet), false_alarms)
+    sessions = len({run.session for run in quiet}) > 1
+    units = [run.session if sessions else run.run_id for run in quiet]
+    return calibrate((response_log(run, robot) for run in quiet), false_alarms, units)
 
 
 def response_log(run: RunLog, robot: Robot) -> tuple[Array, Array, Array]:
@@ -130,7 +132,8 @@ def watch(run: RunLog, robot: Robot, detector: DetectorSettings) -> WatchedRun:
     alarms = np.array([change.alarm_s for change in changes])
     if step is None:
         return WatchedRun(run.run_id, changes, judged, None, None, float("nan"), len(changes))
-    inside = alarms[np.abs(alarms - step.time_s) <= step.crossing_s]
+    begin_s = step.time_s - WINDOW_S / 2
+    inside = alarms[(alarms >= begin_s) & (alarms <= step.time_s + MAX_DELAY_S)]
     delay_s = float(inside[0] - step.time_s) if inside.size else float("nan")
-    early = int((alarms < step.time_s - step.crossing_s).sum())
+    early = int((alarms < begin_s).sum())
     return WatchedRun(run.run_id, changes, judged, step, bool(inside.size), delay_s, early)

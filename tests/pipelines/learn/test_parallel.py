@@ -181,7 +181,7 @@ def test_a_killed_worker_costs_its_task_only(processes):
 @pytest.mark.parametrize(
     ("lost", "request_to_end", "sentence"),
     [
-        ("scheduler", signal.SIGKILL, "does not answer any more"),
+        ("scheduler", signal.SIGKILL, "what was not written yet is lost; features in --cache and trials"),
         ("scheduler", signal.SIGSTOP, "does not answer any more"),
         ("worker", signal.SIGKILL, "no worker of .* has taken a task"),
     ],

@@ -18,6 +18,7 @@ from terrain.logs.run_folders import write_run
 from terrain.records import Label, RunLog, Stream, TargetStatus
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
+from terrain.slip_learning.ground_changes import MAX_DELAY_S
 
 ROBOTINO = load_robot("robotino")
 LENGTH_S = 9.0
@@ -92,7 +93,18 @@ def test_changes_are_found_and_judged(one_ground, two_grounds):
     result = find_changes(two_grounds, one_ground)
     assert result.n_steps == 6
     assert result.found_ratio == 1.0
-    assert abs(result.delay_median_s) < 2.0
+    assert -0.25 <= result.delay_median_s < 2.0
+    assert all(-0.25 <= run.delay_s <= MAX_DELAY_S for run in result.runs)
+    # currents that change 3.5 s before the slip: the alarm is early, which is false, and the change is not found
+    rng, time_s = np.random.default_rng(2), np.arange(0.0, LENGTH_S, 0.031)
+    slip, current = (
+        np.where(time_s < at_s, both["cork"], both["moss"]) for both, at_s in ((SLIP, 6.0), (CURRENT, 2.5))
+    )
+    early = find_changes([omni_run(rng, "early", "", 0.5, slip, current, "border", (0.05, 0.5))], one_ground)
+    assert (early.n_steps, early.found_ratio) == (1, 0.0)
+    assert early.n_early >= 1
+    low, high = result.false_alarm_interval
+    assert low <= result.false_alarm_ratio <= high
     quiet = find_changes(one_ground[:5], one_ground[5:])
     assert (quiet.n_steps, quiet.n_without_step, np.isnan(quiet.found_ratio)) == (0, 5, True)
     with pytest.raises(DataError, match="is watched and calibrated on"):

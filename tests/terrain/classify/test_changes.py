@@ -110,11 +110,40 @@ def quiet():
 def test_quiet_runs_give_an_alarm_as_rarely_as_it_was_asked_for(quiet):
     rng = np.random.default_rng(1)
     alarms = sum(bool(changes_of(*log_of(rng), quiet)) for _ in range(60))
-    assert quiet.false_alarm_ratio <= 0.04
+    low, high = quiet.false_alarm_interval
+    assert low <= quiet.false_alarm_ratio <= high
+    assert low <= 0.02
+    assert quiet.false_alarms_a_minute == pytest.approx(
+        60 * quiet.false_alarm_ratio / (60 * 15 / 60), rel=0.02
+    )
     assert alarms <= 6  # of 60 at 2 %, and a threshold from 60
     for logs in ([log_of(rng, length_s=1.0)], []):
         with pytest.raises(DataError, match="no run is driven steadily for"):
             calibrate(logs)
+
+
+def test_the_rate_of_false_alarms_is_that_of_units_held_out():
+    rng = np.random.default_rng(6)
+    # one of six sessions scatters three times as much: held out with its own runs in training, no run shows it
+    scales, logs = np.repeat([3.0, 1.0, 1.0, 1.0, 1.0, 1.0], 8), []
+    for scale in scales:
+        time_s, current, wheels = log_of(rng)
+        logs.append((time_s, 0.5 + scale * (current - 0.5), wheels))
+    by_run = calibrate(logs, 0.1)
+    by_session = calibrate(logs, 0.1, [f"session {i // 8}" for i in range(48)])
+    assert by_run.threshold == by_session.threshold
+    assert by_session.false_alarm_ratio > by_run.false_alarm_ratio
+    assert np.isnan(calibrate(logs[:1], 0.1).false_alarm_ratio)
+    assert np.isnan(calibrate(logs[:8], 0.1, ["one session"] * 8).false_alarm_interval).all()
+
+
+@pytest.mark.slow
+def test_the_stated_rate_of_false_alarms_is_that_of_new_runs():
+    rng, alarms = np.random.default_rng(7), []
+    for _ in range(20):
+        found = calibrate([log_of(rng, length_s=6.0) for _ in range(60)], 0.05)
+        alarms += [bool(changes_of(*log_of(rng, length_s=6.0), found)) for _ in range(30)]
+    assert np.mean(alarms) == pytest.approx(0.05, abs=0.03)
 
 
 def test_a_hidden_change_is_found_soon_and_dated_well(quiet):
