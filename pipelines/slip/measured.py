@@ -172,7 +172,10 @@ def report(result: MeasuredSlipResult) -> Report:
             Column("RMS of slip left, held out", FINE, of=found.held_out_rms.get),
             Column("about the mean", FINE, of=found.plain_rms.get),
         )
-        note = "Friction of the rollers over the stiffness of traction, both in proportion to a wheel's load."
+        note = (
+            "Friction of the rollers over the stiffness of traction, both in proportion to a wheel's load; intervals "
+            "are within one session."
+        )
         parts.append(Table(columns, list(found.roller_ratio), "what makes it slip", note))
         sentences = list(found.sentences)
         for each in result.named:

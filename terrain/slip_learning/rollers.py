@@ -256,7 +256,7 @@ N_DISTANCE_DRAWS = 1000
 
 
 class DistanceBound(NamedTuple):
-    """Distance of wheels that turn without slip, its 95 % interval over runs, and how well turns agree."""
+    """Distance of wheels that turn without slip, its 95 % interval within one session, and how well turns agree."""
 
     distance_m: float
     interval_m: tuple[float, float]
@@ -269,7 +269,7 @@ class DistanceBound(NamedTuple):
         low_m, high_m = self.interval_m
         return (
             f"turns are those of wheels {self.distance_m:.4f} m from the middle that turn without slip "
-            f"({low_m:.4f} to {high_m:.4f}, {self.n_runs} runs)."
+            f"({low_m:.4f} to {high_m:.4f} within one session, {self.n_runs} runs)."
         )
 
 

@@ -23,6 +23,7 @@ from terrain.slip_learning.curve import (
     targets_of,
     traction_ratio,
     tractive_efficiency,
+    units,
     weighted_resistance,
 )
 from terrain.slip_learning.forces import RunBins, slip_range
@@ -68,6 +69,29 @@ def test_a_law_is_scored_on_runs_that_it_was_not_fitted_to():
     of_all = fit_curve("janosi", runs)
     fitted = odd.log_likelihood(*odd.curve("janosi", of_all), odd.variance("janosi", of_all))
     assert score < fitted - 0.5
+
+
+def test_a_session_is_left_out_whole_and_drawn_whole():
+    """Two runs of a session on softer ground: each excuses the other, unless both are left out."""
+    rng = np.random.default_rng(3)
+    odd, runs = drawn_runs("janosi", (0.6, 0.6), rng)[:2], drawn_runs(*SAND, rng)[:4]
+    both = [each._replace(session=name) for name, each in zip("aabbcc", [*odd, *runs], strict=True)]
+    assert units(both) == [[0, 1], [2, 3], [4, 5]]
+    assert units([*odd, *runs]) == [[i] for i in range(6)]
+    one, others = curve._Pooled(both[:1]), fit_curve("janosi", both[2:])
+    expected = one.log_likelihood(*one.curve("janosi", others), one.variance("janosi", others))
+    by_session, by_run = (select_law(each)[2]["janosi"][0] for each in (both, [*odd, *runs]))
+    assert by_session == pytest.approx(expected, abs=0.1)
+    assert by_session < by_run - 0.5
+    learned = [
+        learn_curve(each, *resistances_of(6), np.random.default_rng(0), n_bootstrap=60)
+        for each in (both, [*odd, *runs])
+    ]
+    assert [(each.n_sessions, each.n_runs) for each in learned] == [(3, 6), (1, 6)]
+    wide, narrow = (each.balance_std for each in learned)
+    assert wide > 1.1 * narrow
+    assert "within one session" in targets_of(learned[1])["steady"].source
+    assert "within one session" not in targets_of(learned[0])["steady"].source
 
 
 def test_slip_errors_do_not_bias_a_steep_law():
