@@ -191,15 +191,16 @@ def taken_over_words(info: ModelInfo, error: float) -> str:
     least = taken or min(info.taken_over, key=lambda each: each.wrong_upper)
     shown = (
         f"from a confidence of {least.confidence:g} {format_value(least.wrong, PERCENT)} of the time is wrong in "
-        f"{least.n_units} training runs or sessions when held out, at most {format_value(least.wrong_upper, PERCENT)} "
-        "with 95 %"
+        f"{plural(least.n_units, f'training {least.unit}')} when held out, at most "
+        f"{format_value(least.wrong_upper, PERCENT)} with 95 %"
     )
+    another = "; what another day does is not shown" if least.unit == "run" else ""
     if taken is None:
         return (
             f"No proposal is taken over unasked, as more than {format_value(error, PERCENT)} (--error) may be wrong: "
-            f"{shown}; label more runs, or answer."
+            f"{shown}; label more, or answer."
         )
-    return f"Proposals are taken over unasked: {shown}."
+    return f"Proposals are taken over unasked: {shown}{another}."
 
 
 def _write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult:

@@ -135,7 +135,8 @@ class TakenOver(NamedTuple):
     ratio: float  #: time in them, of all time
     wrong: float  #: time of that in which they are wrong
     wrong_upper: float  #: not exceeded by it, with 95 %
-    n_units: int  #: sessions or runs that have any
+    n_units: int  #: that have any
+    unit: str  #: what is counted as a whole: session or run
     terrains: tuple[str, ...]  #: that were held out whole; others are never taken over
 
 
@@ -181,7 +182,8 @@ def held_out_errors(
         ratio, n = bad.sum() / time.sum(), time.sum() ** 2 / (time**2).sum()
         _, upper = proportion_interval(n * ratio, n, 2 * LEVEL - 1)
         taken = float(time.sum() / size.sum())
-        found.append(TakenOver(least, taken, float(ratio), upper, int((time > 0).sum()), terrains))
+        counts = int((time > 0).sum()), "run" if np.array_equal(unit, run) else "session"
+        found.append(TakenOver(least, taken, float(ratio), upper, *counts, terrains))
     return tuple(found)
 
 

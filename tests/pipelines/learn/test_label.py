@@ -1,6 +1,7 @@
 """Labels: set by a person, where nothing else of a run changes; or proposed by a model and answered."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -8,8 +9,10 @@ import pandas as pd
 import pytest
 
 from pipelines.data.datasets import load_runs
-from pipelines.learn.label import SOURCES_FILE, Settings
+from pipelines.learn.label import SOURCES_FILE, Settings, taken_over_words
 from pipelines.learn.label import run as label
+from pipelines.learn.model_file import read_model
+from terrain.classify.proposals import TakenOver
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.logs.run_folders import WINDOWS_FILE, RecordedWindow, read_run, windows_text, write_run
 
@@ -180,3 +183,18 @@ def test_a_table_that_does_not_fit_is_refused_in_one_sentence(proposed, tmp_path
     write_run(drive("short", "GRASS", 3, duration_s=1.5), tmp_path / "short")
     with pytest.raises(DataError, match="no run holds a window"):
         label(Settings(data=tmp_path / "short", model=str(tracked[0] / "model")))
+
+
+def test_what_is_taken_over_is_stated_with_what_held_out_runs_show(tracked):
+    info = read_model(str(tracked[0] / "model")).info
+    rows = [(0.7, 0.9, 0.03, 0.06, 160, "run", ("ICE",)), (0.9, 0.5, 0.001, 0.019, 150, "run", ("ICE",))]
+    shown = replace(info, taken_over=tuple(TakenOver(*row) for row in rows))
+    assert taken_over_words(shown, 0.02) == (
+        "Proposals are taken over unasked: from a confidence of 0.9 0.1\N{NO-BREAK SPACE}% of the time is wrong in 150 "
+        "training runs when held out, at most 1.9\N{NO-BREAK SPACE}% with 95 %; what another day does is not shown."
+    )
+    assert "a confidence of 0.7" in taken_over_words(shown, 0.1)
+    assert "No proposal is taken over unasked, as more than 1.0" in taken_over_words(shown, 0.01)
+    assert "held no run out" in taken_over_words(replace(info, taken_over=()), 0.02)
+    with pytest.raises(ConfigError):
+        Settings(data=tracked[0], error=1.5)

@@ -61,7 +61,7 @@ def test_what_is_taken_over_holds_its_error_by_units_and_not_by_windows():
     assert taken_from(errors_of(148, []), 0.02) is None  # 2960 windows, all right
     assert taken_from(errors_of(150, []), 0.02).confidence == 0.7
     (lowest, *_, highest) = errors_of(60, ["run 3", "run 4", "run 5"])
-    assert (lowest.n_units, lowest.ratio) == (60, 1.0)
+    assert (lowest.n_units, lowest.unit, lowest.ratio) == (60, "run", 1.0)
     assert lowest.wrong == pytest.approx(0.05)
     assert lowest.wrong_upper == pytest.approx(0.124, abs=0.001)  # Clopper and Pearson of 3 in 60
     assert highest.confidence == 0.95
