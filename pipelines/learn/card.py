@@ -104,7 +104,7 @@ def model_result(folder: Path, name: str) -> ModelResult:
         model=name,
         windows=info.cut_words,
         n_training_runs=len(info.run_digests),
-        finds_unknown=model.novelty is not None,
+        finds_unknown=model.novelty is not None or model.answers is not None,
         counts_support=model.support is not None,
         names_sets=info.conformal is not None,
         files={file.name: file.stat().st_size for file in files},

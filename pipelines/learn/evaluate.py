@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from features.answers import answers_of
 from features.extractor import FeatureExtractor
 from features.motion import NO_MOTION, window_motion
 from features.protocols import PROTOCOLS, Samples, folds_of, slow_and_fast
@@ -29,6 +30,7 @@ from terrain.classify.held_out import (
     Applicability,
     Examples,
     HeldOut,
+    Looks,
     channel_drops,
     drawn_folds,
     fit_fold,
@@ -49,7 +51,7 @@ from terrain.classify.metrics import (
 )
 from terrain.classify.svm import GroupedSVC
 from terrain.errors import DataError
-from terrain.records import Array
+from terrain.records import Array, Windows
 
 CHECKED_WITH, BASELINE = FEATURE_RECIPE, "plain"
 """The recipe of the checks beside the figures: they are of the data, and have many fits; what a recipe must beat."""
@@ -154,7 +156,7 @@ def evaluate_recipe(
         _, checked = _of_svm(recipe, features, samples, settings)
         terrain, group, gap = samples.terrain, samples.group, samples.gap
         left_out = left_out_folds(terrain, group, N_FOLDS, gap, seed)
-        shared = checked, terrain, group, gap, seed
+        shared = _looks(windows, checked), terrain, group, gap, seed
         scores = [*parallel(score_fold, shared, left_out, settings.jobs, protocol, progress)]
         found |= unknown_figures(scores, terrain, group, windows.start_s, seed)
     elif not published and (settings.extras or channels):
@@ -215,6 +217,12 @@ def _of_svm(
     return recipe[-1], features
 
 
+def _looks(windows: Windows, features: Array) -> Looks:
+    """Return what shows whether the terrain of windows was learned; windows from a cache have no samples."""
+    observed = answers_of(windows) if windows.values else None
+    return Looks(features, observed, windows.start_s + windows.length_s)
+
+
 def _refusals(
     recipe: WindowPipeline,
     features: Array,
@@ -228,7 +236,7 @@ def _refusals(
     terrain, group, rows = samples.terrain, samples.group, np.flatnonzero(held_out.tested)
     first = [each.fold for each in held_out.results if each.fold.repeat == 0]
     shared, refused = (
-        (checked, terrain, group, samples.gap, settings.seed),
+        (_looks(samples.windows, checked), terrain, group, samples.gap, settings.seed),
         np.zeros(len(terrain), dtype=bool),
     )
     folds = [(fold.train, fold.test) for fold in first]

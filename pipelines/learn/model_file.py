@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from features.answers import answers_of
 from features.extractor import is_centred
 from features.windows import Layout, WindowRule
 from pipelines.learn.stored_trees import trees_as_arrays, trees_of_arrays
@@ -35,6 +36,7 @@ from pipelines.learn.trust import check_trusted, import_own
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain import __version__
 from terrain.classify.adaptation import Adaptation, check_adaptation
+from terrain.classify.answers import Answers, check_answers
 from terrain.classify.limits import Novelty, SupportTable, check_novelty, check_support
 from terrain.classify.network import check_network, with_centred
 from terrain.errors import ConfigError, DataError, ModelError
@@ -74,6 +76,7 @@ _TRUSTED = {
     "sklearn.neural_network._stochastic_optimizers": "AdamOptimizer SGDOptimizer",
     "sklearn.utils._bunch": "Bunch",
     "terrain.classify.adaptation": "Adaptation Shift",
+    "terrain.classify.answers": "Answers",
     "terrain.classify.grouped": "OwnClassifier Preparation",
     "terrain.classify.limits": "Novelty SupportTable",
     "terrain.classify.network": "Augmentation GroupedNetwork NetworkChoice SampleColumns Trial",
@@ -82,6 +85,8 @@ _TRUSTED = {
     "terrain.classify.svm": "Candidate GroupedSVC",
     "terrain.classify.trees": "Forest GroupedTrees",
 }
+_LIMITS = {"novelty": Novelty, "support": SupportTable, "adaptation": Adaptation, "answers": Answers}
+
 TRUSTED_TYPES = tuple(f"{module}.{name}" for module, names in _TRUSTED.items() for name in names.split())
 """Types beyond those that skops trusts itself which a model of this package may hold."""
 
@@ -132,8 +137,7 @@ def write_model(folder: Path, model: TerrainModel) -> Own:
     try:
         if network is not None:
             network.onnx_ = b""  # it lies in a file of its own
-        parts = {name: getattr(model, name) for name in ("recipe", "novelty", "support", "adaptation")}
-        content, own = packed(parts)
+        content, own = packed({"recipe": model.recipe, **{name: getattr(model, name) for name in _LIMITS}})
     finally:
         if network is not None:
             network.onnx_ = graph
@@ -212,7 +216,8 @@ def read_model(source: str | Path, trust: Iterable[str] = ()) -> TerrainModel:
         info, contents = read_files(folder)
     file = folder / MODEL_FILE
     try:
-        recipe, novelty, support, adaptation = _unpacked(contents[MODEL_FILE], info.own_code, trust)
+        recipe, limits = _unpacked(contents[MODEL_FILE], info.own_code, trust)
+        novelty, support, adaptation, answers = (limits[name] for name in _LIMITS)
         if (network := _network(recipe)) is not None:
             file = folder / ONNX_FILE
             network.onnx_ = with_centred(contents[ONNX_FILE], {}, info.window_s)
@@ -237,13 +242,15 @@ def read_model(source: str | Path, trust: Iterable[str] = ()) -> TerrainModel:
             n_features = recipe[0].features_of(window).shape[1]
             if novelty.n_features != n_features:
                 raise DataError(f"its novelty score is of {novelty.n_features} features; it has {n_features}")
+        if answers is not None:
+            check_answers(answers, info.classes, answers_of(window))
     except ConfigError:
         raise
     except ModelError as error:
         raise ModelError(f"{source}: {error}") from error
     except Exception as error:  # skops, numpy and scikit-learn raise whatever a stranger's file leads them to
         raise ModelError(f"{file}: cannot be loaded ({_words(error)})") from error
-    return TerrainModel(recipe, info, novelty, support, None, adaptation)
+    return TerrainModel(recipe, info, **limits)
 
 
 @contextmanager
@@ -372,10 +379,8 @@ def _network(recipe: WindowPipeline) -> Any:
     return last if hasattr(last, "onnx_") else getattr(last, "network_", None)
 
 
-def _unpacked(
-    content: bytes, own: Own, trust: Iterable[str]
-) -> tuple[WindowPipeline, Novelty | None, SupportTable | None, Adaptation | None]:
-    """Return recipe, novelty score, support and adaptation of a model file; ``DataError`` says why it is none."""
+def _unpacked(content: bytes, own: Own, trust: Iterable[str]) -> tuple[WindowPipeline, dict[str, Any]]:
+    """Return the recipe of a model file and its limits by name; ``DataError`` says why it is none."""
     from features.recipes import WindowPipeline
 
     with zipfile.ZipFile(streams.BytesIO(content)) as archive:
@@ -390,16 +395,15 @@ def _unpacked(
     found = skops_io().loads(content, trusted=[*TRUSTED_TYPES, *own])
     trees_of_arrays(found)
     parts = found if isinstance(found, dict) else {"recipe": found}
-    names = ("recipe", "novelty", "support", "adaptation")
-    recipe, novelty, support, adaptation = (parts.get(name) for name in names)
+    recipe, limits = parts.get("recipe"), {name: parts.get(name) for name in _LIMITS}
     if not isinstance(recipe, WindowPipeline):
         raise DataError(f"it holds a {type(recipe).__name__}, not a recipe of this package")
     if not hasattr(recipe[0], "layout_"):
         raise DataError("it holds a recipe that was never fitted")
-    for limit, kind in ((novelty, Novelty), (support, SupportTable), (adaptation, Adaptation)):
-        if limit is not None and not isinstance(limit, kind):
+    for name, kind in _LIMITS.items():
+        if (limit := limits[name]) is not None and not isinstance(limit, kind):
             raise DataError(f"it holds a {type(limit).__name__}, {kind.__name__} is read")
-    return recipe, novelty, support, adaptation
+    return recipe, limits
 
 
 def _foreign_types(content: bytes) -> Own:

@@ -111,6 +111,9 @@ class WindowPrediction(NamedTuple):
     supported: bool | None
     #: terrains that hold the true one in 90 % of windows; None where not calibrated
     terrain_set: tuple[str, ...] | None
+    #: misfit of the terrain that explains best how the ground answered; None where the model has no laws
+    answers: float | None
+    reason: str  #: why the terrain is unknown; empty where it is not
 
 
 class Predictions(Result):
@@ -359,6 +362,8 @@ def _predict_windows(
                 novelty=None if np.isnan(assessed.novelty[i]) else float(assessed.novelty[i]),
                 supported=None if np.isnan(assessed.supported[i]) else bool(assessed.supported[i]),
                 terrain_set=None if sets is None else sets[i],
+                answers=None if np.isnan(assessed.answers[i]) else float(assessed.answers[i]),
+                reason=str(assessed.reason[i]),
             )
         )
     return rows
@@ -436,12 +441,17 @@ def _notes(result: Predictions) -> list[Part]:
         refused = f"{format_value(rate, PERCENT)} ({format_value((low, high), PERCENT)}, 95 %)"
     notes = {
         "of runs that the model was trained on the accuracy is no measure of its skill": result.training_runs,
-        f"{result.n_unknown} of {result.n_windows} windows are like no terrain that was learned: unknown, for which "
-        f"the table's fallback is used; of held-out windows of learned ones {refused} are": result.n_unknown,
+        f"{result.n_unknown} of {result.n_windows} windows are like no terrain that was learned, or answer like none: "
+        f"unknown, for which the table's fallback is used; of held-out windows of learned ones "
+        f"{refused} are": result.n_unknown,
         f"counting unknown as wrong, {answered} are right; of what is not unknown, {accepted}": result.n_judged,
         **dict.fromkeys(result.adapted, True),
         "adapted to the session, so that a window whose terrain has less than 0.7 is unknown, too; that this helps is "
         f"{result.adaptation}": result.adaptation,
+        **{
+            f"unknown, {reason}: {plural(count, 'window')}": True
+            for reason, count in Counter(row.reason for row in result.windows if row.reason).most_common(3)
+        },
         f"{result.n_unsupported} predictions are supported by no training run that drove like this": (
             result.n_unsupported
         ),

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from features.answers import answers_of
 from features.extractor import FeatureExtractor
 from features.motion import window_motion
 from features.protocols import Samples, samples_of
@@ -19,6 +20,7 @@ from pipelines.learn.model_file import model_info
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
 from pipelines.live.model import ModelInfo, TerrainModel
+from terrain.classify.answers import learn_answers
 from terrain.classify.limits import (
     Motion,
     conformal_threshold,
@@ -145,20 +147,27 @@ def with_limits(
     samples, features, motion : the windows, their features (n, f), and how the robot moved in each, if known
     """
     notes, conformal, novelty, support, evidence, adaptation = [], None, None, None, None, None
-    terrain, dealt = samples.terrain, {"gap": samples.gap, "seed": info.seed}
+    answers = score = None
+    terrain, windows, dealt = samples.terrain, samples.windows, {"gap": samples.gap, "seed": info.seed}
+    end_s = windows.start_s + windows.length_s
     try:
         terms = held_out_terms(features, terrain, samples.group, **dealt)
         novelty = learn_novelty(features, terrain, samples.group, **dealt, terms=terms)
         score = fisher_scores(novelty.reference, terms)
         evidence = novelty_evidence(score, score > novelty.threshold)
     except DataError as error:
-        notes.append(f"no window is ever called unknown: {error}")
+        notes.append(f"no window is called unknown for its looks: {error}")
+    try:
+        observed = answers_of(windows) if windows.values else None
+        if observed is None:
+            raise DataError("no wheel speed beside a yaw rate, a vibration, a current or a slip is at hand")
+        answers = learn_answers(observed, terrain, samples.group, end_s, score, **dealt)
+    except DataError as error:
+        notes.append(f"whether the ground answers as the named terrain is not compared: {error}")
     try:
         conformal = conformal_threshold(held_out_scores(recipe[-1], terrain), samples.unit)
     except (AttributeError, DataError) as error:
         notes.append(f"no sets of terrains: {error}")
-    windows = samples.windows
-    end_s = windows.start_s + windows.length_s
     over_time = choose_settings(
         recipe[-1], terrain, end_s, windows.groups, windows.length_s, info.class_ratio, evidence
     )
@@ -180,7 +189,7 @@ def with_limits(
         )
     except DataError as error:
         notes.append(f"no adapting to a session: {error}")
-    return TerrainModel(recipe, info, novelty, support, None, adaptation), tuple(notes)
+    return TerrainModel(recipe, info, novelty, support, None, adaptation, answers), tuple(notes)
 
 
 def _errors_taken_over(classifier: Any, info: ModelInfo, samples: Samples) -> tuple[TakenOver, ...]:

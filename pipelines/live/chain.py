@@ -163,7 +163,7 @@ class Chain:
         if self.source.settled:
             switching = switching._replace(dwell_s=0.0, probability_least=0.0)
         for found in self.source.update(sample, estimates):
-            self.belief = update(self.belief, *found, switching)
+            self.belief = update(self.belief, found.time_s, found.terrain, found.probability, switching)
             status = output_status(found.terrain, found.probability, switching)
         return OutputStatus.REFUSED if any(each.refused for each in self.source.outputs) else status
 

@@ -13,15 +13,16 @@ from typing import NamedTuple
 import numpy as np
 
 from features.stream import WindowFeed
-from pipelines.live.model import SessionStart, TerrainModel, assess
+from pipelines.live.model import Recent, SessionStart, TerrainModel, assess
 from pipelines.live.windows import feed_of
+from terrain.classify.answers import MANOEUVRE_S
 from terrain.classify.terrain_filter import LiveTerrainFilter
 from terrain.control.switching import UNKNOWN, TerrainEstimate, TerrainSource
 from terrain.errors import DataError
 from terrain.estimation.clocks import last_stamp_s
 from terrain.estimation.live import CHANNELS, Estimate
 from terrain.extension import correct_live
-from terrain.records import Reading, Sample, Windows
+from terrain.records import Array, Reading, Sample, Windows
 from terrain.robots import Robot
 
 PILOT_FILTER = "vio15"  #: Filter of :class:`pipelines.live.pilot.LivePilot`
@@ -51,14 +52,27 @@ class WindowOutput(NamedTuple):
     novelty: float = math.nan
     #: whether training runs that drove like this support the class; None where not counted
     supported: bool | None = None
+    #: misfit of the terrain that explains best how the ground answered; NaN where the model has no laws
+    answers: float = math.nan
+    reason: str = ""  #: why the terrain is unknown; empty where it is not
 
 
-def classify_window(model: TerrainModel, window: Windows) -> WindowOutput:
-    """Return the output of a model for one window; one that it refuses gives none, and raises nothing."""
+def classify_window(
+    model: TerrainModel, window: Windows, recent: deque[tuple[Array, float]] | None = None
+) -> WindowOutput:
+    """Return the output of a model for one window; one that it refuses gives none, and raises nothing.
+
+    ``recent`` has misfits (k, q) and end of the windows before this one, to which those of this one are added.
+    """
     start_s, classes, started_s = float(window.start_s[0]), model.info.classes, perf_counter()
     end_s = start_s + window.length_s
     try:
-        assessed = assess(model, window)
+        recent = deque() if recent is None else recent
+        while recent and recent[0][1] <= end_s - MANOEUVRE_S:
+            recent.popleft()
+        earlier = Recent(*(np.array(each) for each in zip(*recent, strict=True))) if recent else None
+        assessed = assess(model, window, earlier)
+        recent.append((assessed.misfits[0], end_s))
         probabilities = assessed.probability[0]
         if not np.isfinite(probabilities).all():
             raise DataError("a probability is not finite")
@@ -80,6 +94,8 @@ def classify_window(model: TerrainModel, window: Windows) -> WindowOutput:
         nearest,
         float(assessed.novelty[0]),
         None if math.isnan(supported) else bool(supported),
+        float(assessed.answers[0]),
+        str(assessed.reason[0]),
     )
 
 
@@ -88,6 +104,7 @@ class _Part(NamedTuple):
 
     session: SessionStart
     feed: WindowFeed
+    recent: deque[tuple[Array, float]]  #: misfits and ends of its last windows
 
 
 class Classifier(TerrainSource):
@@ -189,7 +206,7 @@ class Classifier(TerrainSource):
         self._over_time = None if model.over_time is None else LiveTerrainFilter(model.over_time)
         self.settled = self._over_time is not None
         self._due_s = math.inf
-        self._waiting.append(_Part(session or SessionStart(model), feed))
+        self._waiting.append(_Part(session or SessionStart(model), feed, deque()))
         self._do_what_waits()
 
     def _do_what_waits(self) -> None:
@@ -239,7 +256,7 @@ class Classifier(TerrainSource):
                 elif self._part is not None:
                     for window in self._part.feed.push(*taken):
                         model = self._part.session.take(window)
-                        self._finished.append(classify_window(model, window))
+                        self._finished.append(classify_window(model, window, self._part.recent))
                         self.adapted = "" if model.adaptation is None else model.adaptation.found
         finally:
             if self._part is not None:
@@ -263,5 +280,6 @@ class Classifier(TerrainSource):
                 terrain = classes[best] if best >= 0 else UNKNOWN
             elif output.refused:
                 continue
-            found.append(TerrainEstimate(output.end_s, terrain, probability))
+            reason = "" if terrain else output.reason
+            found.append(TerrainEstimate(output.end_s, terrain, probability, reason))
         return found

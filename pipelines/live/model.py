@@ -1,7 +1,8 @@
 """A trained model, and what it says of windows.
 
 A window is *unknown* where it is less like all learned terrains than nearly all known windows are
-(:mod:`terrain.classify.limits`), and *unsupported* where few training runs drove the predicted
+(:mod:`terrain.classify.limits`), or the ground answers as none of them does (:mod:`terrain.classify.answers`), and
+*unsupported* where few training runs drove the predicted
 terrain like this (:mod:`terrain.classify.limits`).  Of windows of known terrains,
 5 % are unknown by definition.
 """
@@ -15,10 +16,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from features.answers import answers_of
 from features.motion import window_motion
 from features.windows import Layout, SteadyMotion, WindowRule, join_windows
 from pipelines.report.results import described
 from terrain.classify.adaptation import CERTAIN, Adaptation, adapt, corrected, corrections, start_of
+from terrain.classify.answers import Answers, best_misfit, over_manoeuvre, rarities
 from terrain.classify.limits import (
     LEVEL,
     SUPPORTED,
@@ -97,10 +100,9 @@ class ModelInfo:
 class TerrainModel(NamedTuple):
     """A fitted recipe, and how its training windows were cut.
 
-    ``recipe`` has ``predict_proba(windows)``, ``classes_`` and ``matrix`` of features.  ``novelty`` and ``support``
-    are None of training runs that give none; ``over_time`` are the settings of the filter of its outputs, where they
-    are to be filtered; ``adaptation`` is what was learned of sessions, and the shift of the
-    present one.
+    ``recipe`` has ``predict_proba(windows)``, ``classes_`` and ``matrix`` of features.  ``novelty``, ``support`` and
+    ``answers`` are None of training runs that give none; ``over_time`` are the settings of the filter of its outputs,
+    where they are to be filtered; ``adaptation`` is what was learned of sessions, and the shift of the present one.
     """
 
     recipe: Any
@@ -109,6 +111,7 @@ class TerrainModel(NamedTuple):
     support: SupportTable | None = None
     over_time: FilterSettings | None = None
     adaptation: Adaptation | None = None
+    answers: Answers | None = None
 
     def adapt(self, windows: Windows, terrain: str = "") -> TerrainModel:
         """Return the model for a session, of which there are some windows: all on one terrain, or on what is not known.
@@ -162,7 +165,13 @@ class SessionStart:
         if self._kept is None or not len(windows):
             return assess(self.model, windows)
         start = start_of(join_windows([*self._kept, windows]))[-len(windows) :]
-        parts = [assess(self.take(each), each) for each in (windows[start], windows[~start]) if len(each)]
+        parts: list[Assessed] = []
+        for each in (windows[start], windows[~start]):
+            if len(each):
+                before = (
+                    Recent(parts[0].misfits, windows.start_s[start] + windows.length_s) if parts else None
+                )
+                parts.append(assess(self.take(each), each, before))
         return Assessed(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
     def take(self, windows: Windows) -> TerrainModel:
@@ -197,27 +206,70 @@ class Assessed(NamedTuple):
     unknown: Array  #: (n,) whether the window is like no terrain that was learned
     #: (n,) whether training runs near the window's motion support the prediction; NaN where not counted
     supported: Array
+    #: (n,) misfit of the terrain that explains best how the ground answered in the manoeuvre; NaN without laws
+    answers: Array
+    reason: Array  #: (n,) why a window is unknown, in words; empty where it is not
+    misfits: Array  #: (n, k, q) of each window alone, as :meth:`Answers.misfits`; (n, 0, 0) without laws
 
 
-def assess(model: TerrainModel, windows: Windows) -> Assessed:
-    """Return what a model says of windows.
+class Recent(NamedTuple):
+    """Misfits (m, k, q) of the windows of a run before those that are assessed, and their ends (m,)."""
+
+    misfits: Array
+    end_s: Array
+
+
+NOT_LIKE = "no learned terrain looks like this"
+NOT_CERTAIN = f"as the session is adapted to, no terrain has a probability of {CERTAIN:g}"
+
+
+def assess(model: TerrainModel, windows: Windows, recent: Recent | None = None) -> Assessed:
+    """Return what a model says of windows, those of a run in order of time.
+
+    Parameters
+    ----------
+    recent : earlier windows of the run of the first window
 
     Raises
     ------
     DataError
         if the windows are not those that the model requires.
     """
-    supported = np.full(len(windows), np.nan)
+    answers = supported = np.full(len(windows), np.nan)
     probability, novelty = _outputs(model, windows)
-    unknown = np.zeros(len(windows), dtype=bool)
+    unknown, misfits = np.zeros(len(windows), dtype=bool), np.zeros((len(windows), 0, 0))
     if model.novelty is not None:
         unknown = ~(novelty <= model.novelty.threshold)
+    answering: dict[int, str] = {}
+    if (laws := model.answers) is not None:
+        misfits, end_s, run = (
+            laws.misfits(answers_of(windows)),
+            windows.start_s + windows.length_s,
+            windows.run_id,
+        )
+        earlier, earlier_s = recent or (misfits[:0], end_s[:0])
+        run = np.concatenate([np.repeat(run[:1], len(earlier_s)), run])
+        all_misfits, all_s = np.concatenate([earlier, misfits]), np.concatenate([earlier_s, end_s])
+        over = over_manoeuvre(all_misfits, all_s, run)[len(earlier_s) :]
+        answers = best_misfit(over)
+        rare = rarities(laws.reference, np.stack([novelty, answers], axis=1))
+        unknown = (np.linalg.norm(rare, axis=1) > laws.threshold) | (
+            np.isnan(novelty) & (model.novelty is not None)
+        )
+        answering = {
+            row: laws.reason(over[row], str(model.recipe.classes_[probability[row].argmax()]))
+            for row in np.flatnonzero(unknown & (rare[:, 1] > 0.0) & (rare[:, 1] >= rare[:, 0])).tolist()
+        }
+    reason = np.array(
+        [answering.get(row, NOT_LIKE if each else "") for row, each in enumerate(unknown)], dtype=object
+    )
     if model.adaptation is not None and model.adaptation.shift is not None:
-        unknown |= ~(probability.max(axis=1) >= CERTAIN)
+        doubtful = ~(probability.max(axis=1) >= CERTAIN)
+        reason[doubtful & ~unknown], unknown = NOT_CERTAIN, unknown | doubtful
     if model.support is not None and (motion := window_motion(windows)) is not None:
         near = model.support.near_runs(motion.speed_mps, motion.yaw_rate_radps)
         supported = (supported_probability(probability, near) >= SUPPORTED).astype(float)
-    return Assessed(probability, novelty, unknown, supported)
+    return Assessed(probability, novelty, unknown, supported, answers, reason, misfits)
 
 
 def _outputs(model: TerrainModel, windows: Windows) -> tuple[Array, Array]:

@@ -46,7 +46,10 @@ MOTION = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
 SEEN = ("slip_ratio", "slip_std", "wheel_speed_mps", "current_a", *MOTION)
 """What an observation has of the estimate of a motion."""
 
-WINDOW = ("start_s", "end_s", "terrain", "probabilities", "refused", "nearest", "novelty", "supported")
+WINDOW = (
+    *("start_s", "end_s", "terrain", "probabilities", "refused", "nearest", "novelty", "supported"),
+    *("answers", "reason"),
+)
 """What an observation has of the last window; an empty text is null."""
 
 

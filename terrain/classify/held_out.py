@@ -16,8 +16,15 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from sklearn.base import clone
 
+from terrain.classify.answers import Observed, best_misfit, joint_score, learn_answers, over_manoeuvre
 from terrain.classify.folds import Fold, divided_units, run_of, split_runs, units_of
-from terrain.classify.limits import conformal_threshold, held_out_scores, learn_novelty
+from terrain.classify.limits import (
+    conformal_threshold,
+    fisher_scores,
+    held_out_scores,
+    held_out_terms,
+    learn_novelty,
+)
 from terrain.errors import DataError
 from terrain.records import Array
 
@@ -188,7 +195,7 @@ def left_out_folds(
 
 
 class Scored(NamedTuple):
-    """Held-out known rows and all unknown rows, their novelty by one fold, and the fold's threshold."""
+    """Held-out known rows and all unknown rows, their scores by one fold, and the fold's threshold."""
 
     known: Array
     unknown: Array
@@ -197,18 +204,49 @@ class Scored(NamedTuple):
     threshold: float
 
 
+class Looks(NamedTuple):
+    """What shows of n rows whether their terrain was learned: features (n, f), and what the ground answered."""
+
+    features: Array
+    observed: Observed | None
+    end_s: Array  #: (n,) of the window
+
+
+def _unlike(
+    looks: Looks, y: Array, group: Array, gap: int, seed: int, train: Array
+) -> tuple[Callable[[Array], Array], float]:
+    """Return what scores rows by how unlike learned terrains they are, fitted on training rows; and its threshold."""
+    X, observed, end_s = looks
+    of_train = X[train], y[train], group[train]
+    terms = held_out_terms(*of_train, gap=gap, seed=seed)
+    fitted = learn_novelty(*of_train, gap=gap, seed=seed, terms=terms)
+    if observed is None:
+        return lambda rows: fitted.score(X[rows]), fitted.threshold
+    held_out = fisher_scores(fitted.reference, terms)
+    laws = learn_answers(observed.of(train), *of_train[1:], end_s[train], held_out, gap=gap, seed=seed)
+
+    def score(rows: Array) -> Array:
+        misfits = over_manoeuvre(laws.misfits(observed.of(rows)), end_s[rows], run_of(group[rows]))
+        novelty = fitted.score(X[rows])
+        return np.where(np.isnan(novelty), np.nan, joint_score(laws.reference, novelty, best_misfit(misfits)))
+
+    return score, laws.threshold
+
+
 def score_fold(
-    X: Array, y: Array, group: Array, gap: int, seed: int, train: Array, test: Array, unknown: Array
+    looks: Looks, y: Array, group: Array, gap: int, seed: int, train: Array, test: Array, unknown: Array
 ) -> Scored:
-    """Return the novelty of held-out and of unknown rows, by a score that is fitted on training rows."""
-    fitted = learn_novelty(X[train], y[train], group[train], gap=gap, seed=seed)
-    return Scored(test, unknown, fitted.score(X[test]), fitted.score(X[unknown]), fitted.threshold)
+    """Return how unlike learned terrains held-out and unknown rows are, by what is fitted on training rows."""
+    score, threshold = _unlike(looks, y, group, gap, seed, train)
+    return Scored(test, unknown, score(test), score(unknown), threshold)
 
 
-def refused_rows(X: Array, y: Array, group: Array, gap: int, seed: int, train: Array, test: Array) -> Array:
-    """Return whether each test row is called unknown, by a score of novelty that is fitted on training rows."""
-    fitted = learn_novelty(X[train], y[train], group[train], gap=gap, seed=seed)
-    return ~(fitted.score(X[test]) <= fitted.threshold)
+def refused_rows(
+    looks: Looks, y: Array, group: Array, gap: int, seed: int, train: Array, test: Array
+) -> Array:
+    """Return whether each test row is called unknown, by what is fitted on training rows."""
+    score, threshold = _unlike(looks, y, group, gap, seed, train)
+    return ~(score(test) <= threshold)
 
 
 #: Slow and fast runs of a class that are compared: at least so many, of so much time.

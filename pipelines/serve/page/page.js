@@ -118,7 +118,7 @@
     const window_ = seen.window;
     if (!window_) return;
     text("window", window_.refused ? "last window refused: " + window_.refused
-      : "last window " + fixed(window_.start_s, 1) + " to " + fixed(window_.end_s, 1, " s") + ": " + (window_.terrain || "unlike every learned terrain")
+      : "last window " + fixed(window_.start_s, 1) + " to " + fixed(window_.end_s, 1, " s") + ": " + (window_.terrain || "unknown, " + (window_.reason || "unlike every learned terrain"))
         + (window_.supported === false ? ", no training run supports it" : ""));
     const box = byId("classes"), names = Object.keys(window_.probabilities);
     if (box.children.length !== names.length || box.dataset.names !== names.join()) {

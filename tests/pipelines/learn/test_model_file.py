@@ -45,6 +45,20 @@ def test_a_saved_model_predicts_the_same_to_the_last_bit(model_dir, windows, mod
     assert set(skops_io().get_untrusted_types(file=model_dir / MODEL_FILE)) <= set(TRUSTED_TYPES)
 
 
+def test_laws_of_response_are_kept_and_those_that_do_not_fit_are_refused(model_dir, model, put):
+    held = skops_io().loads((model_dir / MODEL_FILE).read_bytes(), trusted=list(TRUSTED_TYPES))
+    for name, value in zip(model.answers._fields, model.answers, strict=True):
+        np.testing.assert_array_equal(getattr(held["answers"], name), value)
+    for wrong, sentence in (
+        (model.answers._replace(classes=("ICE", "MUD", "TAR")), "of other terrains"),
+        (model.answers._replace(noise=model.answers.noise[:-1]), "the noise of the laws of response are not"),
+        (model.novelty, "holds a Novelty, Answers is read"),
+    ):
+        put(skops_io().dumps(held | {"answers": wrong}))
+        with pytest.raises(ModelError, match=sentence):
+            read_model(model_dir)
+
+
 def test_one_flipped_bit_anywhere_is_seen(model_dir):
     whole = (model_dir / MODEL_FILE).read_bytes()
     for place in (0, len(whole) // 2, len(whole) - 1):

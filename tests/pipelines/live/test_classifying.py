@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections import namedtuple
+from collections import deque, namedtuple
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from types import SimpleNamespace
@@ -12,6 +12,7 @@ import pytest
 
 from features.windows import cut_windows
 from pipelines.live.classifying import AT_MOST, MAX_WAITING, Classifier, WindowOutput, classify_window
+from pipelines.live.model import assess
 from terrain.classify.terrain_filter import check_settings
 from terrain.estimation.live import LiveFilter
 from terrain.kinematics.logged_wheels import with_wheel_speeds
@@ -42,9 +43,9 @@ def estimated(run):
 def test_live_windows_and_outputs_equal_those_of_the_enriched_log(swerve_model, survey, monkeypatch):
     shown, found, late_s = [], [], []
 
-    def classify(model, window):
+    def classify(model, window, recent):
         shown.append(window)
-        return classify_window(model, window)
+        return classify_window(model, window, recent)
 
     monkeypatch.setattr("pipelines.live.classifying.classify_window", classify)
     classifier, estimator = Classifier(swerve_model, ROBOT), LiveFilter(ROBOT)
@@ -64,6 +65,24 @@ def test_live_windows_and_outputs_equal_those_of_the_enriched_log(swerve_model, 
     assert [one.probability for one in found] == pytest.approx(probability.max(axis=1), abs=1e-12)
     assert [one.time_s for one in found] == (batch.start_s + batch.length_s).tolist()
     assert np.abs(late_s).max() < 0.05
+
+
+def test_windows_one_by_one_are_assessed_as_those_of_a_log_and_say_why_they_are_unknown(model, windows):
+    """Over a manoeuvre of several windows, which ends with the run; a ground that turns the robot half as far."""
+    run = windows[windows.run_id == windows.run_id[-1]]
+    place = run.channels["imu"].index("gyro_z_radps")
+    imu = run.values["imu"].copy()
+    imu[:, place] = imu[:, place] * 0.2 + 0.6
+    run = replace(run, values={**run.values, "imu": imu})
+    batch, recent = assess(model, run), deque()
+    for i in range(len(run)):
+        output = classify_window(model, run[i], recent)
+        assert output.answers == pytest.approx(batch.answers[i], rel=1e-9)
+        assert (output.terrain == "", output.reason) == (batch.unknown[i], batch.reason[i])
+        assert len(recent) <= 3
+    assert batch.unknown.all()
+    assert "does not turn like this" in batch.reason[-1]
+    assert assess(model, run[-1]).answers[0] != batch.answers[-1]
 
 
 # The thread that cuts and classifies
@@ -92,7 +111,7 @@ def gate(monkeypatch):
 
         return SimpleNamespace(due_s=0.0, dropped={}, push=push)
 
-    def classify(model, window):
+    def classify(model, window, recent):
         assert event.wait(10.0)
         if window.start_s[0] < 0:
             raise KeyError("unforeseen")

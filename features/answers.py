@@ -1,0 +1,120 @@
+"""Windows to what the ground answers to the wheels: turning, shaking, currents and slip, and what they depend on.
+
+Each quantity is one number a window, and comes with the numbers of the driving that its law is linear in.  With the
+mean circumferential speeds l and r of the two sides, ``m = (l + r) / 2`` and ``d = r - l``:
+
+- *turn*: mean yaw rate, of ``1, d, m, d |d|, d |m|``; without two sides of the speed of each wheel.  On a skid-steered
+  robot ``d`` over the yaw rate is the effective track, which slip widens (Mandow et al. 2007, Experimental kinematics
+  for wheeled skid-steer mobile robots);
+- *shake*: logarithm of the rms of horizontal and vertical acceleration and of roll and pitch rate between 1 and 10 and
+  between 10 and 24 Hz, where the rate allows, of speed (logarithm), of how much is turned, and of their product: in
+  bands of fixed frequencies, so that loggers of several rates compare;
+- *current*: magnitude of all motors together, of its ripple, and of the right side over the left, of speeds and
+  acceleration;
+- *slip*: mean of all wheels, as shaking.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from features.windows import rows_of_sets, wheel_stream
+from terrain.classify.answers import Observed
+from terrain.logs.schema import signal_set_of
+from terrain.records import Array, Windows
+
+BANDS_HZ = ((1.0, 10.0), (10.0, 24.0))
+MAX_BAND = 0.52  #: Of the rate: up to there a band may reach. A logger of 20 Hz has the first.
+SHAKEN = {"horizontal": ("accel_x", "accel_y"), "vertical": ("accel_z",), "rocking": ("gyro_x", "gyro_y")}
+#: Speed, current and squared acceleration or rate under a logarithm: what a sensor resolves.
+MIN_SPEED_MPS, MIN_CURRENT_A, MIN_POWER = 0.05, 0.1, 1e-8
+MIN_DEFINED = 0.5  #: Share of a window in which slip has to be defined
+
+
+def answers_of(windows: Windows) -> Observed | None:
+    """Return what the ground answers in each window; None where no wheel speed is measured, or nothing beside.
+
+    Examples
+    --------
+    >>> wheels, imu = np.array([[[0.5] * 4, [0.7] * 4]]), np.array([[[0.3] * 4]])
+    >>> channels = {"wheels": ("speed_left_mps", "speed_right_mps"), "imu": ("gyro_z_radps",)}
+    >>> rates = {"wheels": 2.0, "imu": 2.0}
+    >>> windows = Windows({"wheels": wheels, "imu": imu}, channels, rates, 2.0, np.zeros(1), *[np.zeros(1)] * 2)
+    >>> observed = answers_of(windows)
+    >>> observed.quantities, observed.response.round(2).tolist(), observed.driving.round(2).tolist()
+    (('turn',), [[0.3]], [[[1.0, 0.2, 0.6, 0.04, 0.12]]])
+    """
+    stream = wheel_stream(windows.channels)
+    if stream is None:
+        return None
+    names = windows.channels[stream]
+    places = rows_of_sets(stream, tuple(names), frozenset({"wheels"}))
+    speeds = windows.values[stream][:, list(places)]
+    mean, ones = speeds.mean(axis=2), np.ones(len(windows))
+    sides = [[i for i, at in enumerate(places) if side in names[at].split("_")] for side in ("left", "right")]
+    sided = all(sides)
+    time_s = (np.arange(speeds.shape[2]) - 0.5 * (speeds.shape[2] - 1)) / windows.rate_hz[stream]
+    if sided:
+        left, right = (mean[:, side].mean(axis=1) for side in sides)
+        m, d = 0.5 * (left + right), right - left
+        turning = [ones, d, m, d * np.abs(d), d * np.abs(m)]
+        forward = np.where(m < 0.0, -1.0, 1.0)
+        gain_mps2 = forward * (speeds.mean(axis=1) @ time_s) / (time_s @ time_s)
+        turned = np.abs(d) / (np.abs(left) + np.abs(right) + MIN_SPEED_MPS)
+    else:
+        m, d = np.abs(mean).mean(axis=1), np.ptp(np.abs(mean), axis=1)
+        turning = [ones, *mean.T]
+        gain_mps2 = (np.abs(speeds).mean(axis=1) @ time_s) / (time_s @ time_s)
+        turned = d / (np.abs(mean).sum(axis=1) + MIN_SPEED_MPS)
+    fastest = np.log10(np.abs(mean).max(axis=1) + MIN_SPEED_MPS)
+    shaking = [ones, fastest, turned, fastest * turned]
+    found: dict[str, tuple[Array, list[Array]]] = {}
+    for each, channels in windows.channels.items():
+        sets = [signal_set_of(each, name) for name in channels]
+        values, rate_hz = windows.values[each], windows.rate_hz[each]
+        if "gyro_z_radps" in channels and "imu" in sets:
+            found["turn"] = values[:, channels.index("gyro_z_radps")].mean(axis=1), turning
+        bands = [band for band in BANDS_HZ if band[1] <= MAX_BAND * rate_hz]
+        shaken = {
+            kind: rows
+            for kind, quantities in SHAKEN.items()
+            if (rows := [i for i, name in enumerate(channels) if name.startswith(quantities)])
+        }
+        if "imu" in sets and bands and shaken:
+            taper = np.hanning(values.shape[2])
+            lines = np.fft.rfft((values - values.mean(axis=2, keepdims=True)) * taper, axis=2)
+            power = (lines.real**2 + lines.imag**2) * (2.0 / (len(taper) * (taper @ taper)))
+            hz = np.fft.rfftfreq(len(taper), 1.0 / rate_hz)
+            for low, high in bands:
+                within = power[:, :, (hz >= low) & (hz < high)].sum(axis=2)
+                for kind, rows in shaken.items():
+                    name = f"shake, {kind}, {low:g} to {high:g} Hz"
+                    found[name] = 0.5 * np.log10(within[:, rows].sum(axis=1) + MIN_POWER), shaking
+        currents = [i for i, of in enumerate(sets) if of == "currents"]
+        if currents:
+            drawn = np.abs(values[:, currents])
+            load = drawn.mean(axis=2)
+            found["current"] = load.sum(axis=1), [ones, np.abs(m), np.abs(d), gain_mps2, turned]
+            ripple = np.log10(np.sqrt(drawn.var(axis=2).sum(axis=1)) + MIN_CURRENT_A)
+            found["current, ripple"] = ripple, shaking
+            halves = [
+                [k for k, i in enumerate(currents) if side in channels[i].split("_")]
+                for side in ("left", "right")
+            ]
+            if sided and all(halves):
+                over = load[:, halves[1]].sum(axis=1) - load[:, halves[0]].sum(axis=1)
+                found["current, sides"] = over, [ones, d, d * forward, m]
+        slips = [i for i, of in enumerate(sets) if of == "slip"]
+        if slips:
+            slip = values[:, slips].reshape(len(windows), -1)
+            known = np.isfinite(slip)
+            share = known.mean(axis=1)
+            total = np.where(known, slip, 0.0).mean(axis=1)
+            undefined = np.full(len(windows), np.nan)
+            found["slip"] = np.divide(total, share, out=undefined, where=share >= MIN_DEFINED), shaking
+    if not found:
+        return None
+    driving = np.zeros((len(windows), len(found), max(len(of) for _, of in found.values())))
+    for number, (_, of) in enumerate(found.values()):
+        driving[:, number, : len(of)] = np.column_stack(of)
+    return Observed(tuple(found), np.column_stack([response for response, _ in found.values()]), driving)
