@@ -49,7 +49,7 @@ def answers_of(windows: Windows) -> Observed | None:
         return None
     names = windows.channels[stream]
     places = rows_of_sets(stream, tuple(names), frozenset({"wheels"}))
-    speeds = windows.values[stream][:, list(places)]
+    speeds = np.ascontiguousarray(windows.values[stream][:, list(places)])  # a window adds up as among many
     mean, ones = speeds.mean(axis=2), np.ones(len(windows))
     sides = [[i for i, at in enumerate(places) if side in names[at].split("_")] for side in ("left", "right")]
     sided = all(sides)
@@ -59,12 +59,12 @@ def answers_of(windows: Windows) -> Observed | None:
         m, d = 0.5 * (left + right), right - left
         turning = [ones, d, m, d * np.abs(d), d * np.abs(m)]
         forward = np.where(m < 0.0, -1.0, 1.0)
-        gain_mps2 = forward * (speeds.mean(axis=1) @ time_s) / (time_s @ time_s)
+        gain_mps2 = forward * (speeds.mean(axis=1) * time_s).sum(axis=1) / (time_s @ time_s)
         turned = np.abs(d) / (np.abs(left) + np.abs(right) + MIN_SPEED_MPS)
     else:
         m, d = np.abs(mean).mean(axis=1), np.ptp(np.abs(mean), axis=1)
         turning = [ones, *mean.T]
-        gain_mps2 = (np.abs(speeds).mean(axis=1) @ time_s) / (time_s @ time_s)
+        gain_mps2 = (np.abs(speeds).mean(axis=1) * time_s).sum(axis=1) / (time_s @ time_s)
         turned = d / (np.abs(mean).sum(axis=1) + MIN_SPEED_MPS)
     fastest = np.log10(np.abs(mean).max(axis=1) + MIN_SPEED_MPS)
     shaking = [ones, fastest, turned, fastest * turned]
@@ -92,7 +92,7 @@ def answers_of(windows: Windows) -> Observed | None:
                     found[name] = 0.5 * np.log10(within[:, rows].sum(axis=1) + MIN_POWER), shaking
         currents = [i for i, of in enumerate(sets) if of == "currents"]
         if currents:
-            drawn = np.abs(values[:, currents])
+            drawn = np.ascontiguousarray(np.abs(values[:, currents]))
             load = drawn.mean(axis=2)
             found["current"] = load.sum(axis=1), [ones, np.abs(m), np.abs(d), gain_mps2, turned]
             ripple = np.log10(np.sqrt(drawn.var(axis=2).sum(axis=1)) + MIN_CURRENT_A)
@@ -106,7 +106,7 @@ def answers_of(windows: Windows) -> Observed | None:
                 found["current, sides"] = over, [ones, d, d * forward, m]
         slips = [i for i, of in enumerate(sets) if of == "slip"]
         if slips:
-            slip = values[:, slips].reshape(len(windows), -1)
+            slip = np.ascontiguousarray(values[:, slips].reshape(len(windows), -1))
             known = np.isfinite(slip)
             share = known.mean(axis=1)
             total = np.where(known, slip, 0.0).mean(axis=1)

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from sklearn.model_selection import StratifiedKFold
 
+from features.answers import answers_of
 from features.motion import fastest_wheel
 from features.windows import (
     TIME_TOLERANCE_S,
@@ -27,6 +28,7 @@ from features.windows import (
     regular_starts,
     span_of,
 )
+from terrain.classify.answers import Observed
 from terrain.classify.folds import (
     N_FOLDS,
     Fold,
@@ -68,6 +70,12 @@ class Samples(NamedTuple):
     merged: tuple[tuple[str, ...], ...] = ()  #: ids of runs that hold the same measurements and were made one
     runs: Sequence[RunLog] = ()  #: that the windows were cut from; empty where they are not at hand
     repaired: Mapping[str, int] = MappingProxyType({})  #: what a repairing reader changed, by kind
+    cached: Observed | None = None  #: what the ground answered, of windows without samples
+
+    @property
+    def observed(self) -> Observed | None:
+        """What the ground answered in each window; None where it is not measured."""
+        return answers_of(self.windows) if self.windows.values else self.cached
 
     @property
     def terrain(self) -> Array:

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from features.answers import answers_of
 from features.extractor import FeatureExtractor
 from features.motion import window_motion
 from features.protocols import Samples
@@ -30,6 +31,7 @@ from pipelines.learn.settings import LearnSettings
 from pipelines.learn.training_data import TrainingData, trained_runs
 from pipelines.report.results import Progress, as_json, silent
 from terrain import __version__
+from terrain.classify.answers import Observed
 from terrain.classify.limits import Motion
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.files.atomic import atomic_file, ensure_writable
@@ -37,7 +39,7 @@ from terrain.logs.duplicates import RunPrint, possible_pairs, run_print, sentenc
 from terrain.logs.run_folders import data_digest, joint_digest
 from terrain.records import Array, RunLog, Stream, Windows
 
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
 
 
 class RunHead(NamedTuple):
@@ -204,12 +206,17 @@ def _store_run(
     windows = cut.windows
     moved = window_motion(windows)
     motion = Motion(*np.full((len(Motion._fields), len(windows)), np.nan)) if moved is None else moved
+    observed = answers_of(windows) or Observed(
+        (), np.zeros((len(windows), 0)), np.zeros((len(windows), 0, 1))
+    )
+    answers = np.column_stack([observed.response, observed.driving.reshape(len(windows), -1)])
     _write(
         file,
-        {"dropped": dict(cut.dropped)},
+        {"dropped": dict(cut.dropped), "quantities": observed.quantities},
         start_s=windows.start_s,
         terrain=windows.terrain,
         features=extractor.transform(windows).astype(np.float64),
+        **({"answers": answers} if observed.quantities else {}),
         **motion._asdict(),
     )
 
@@ -218,12 +225,13 @@ def _table(
     heads: Sequence[RunHead], files: Sequence[Path], rule: WindowRule
 ) -> tuple[Samples, Array, Motion]:
     """Return the labelled windows of all runs, run by run and in order of time, their features and motion."""
-    parts, dropped = [], Counter[str]()
+    parts, dropped, quantities = [], Counter[str](), ()
     for head, file in zip(heads, files, strict=True):
         if (found := _read(file)) is None:
             raise LogError(f"{file}: was changed while it was used")
         about, columns = found
         dropped.update(about["dropped"])
+        quantities = tuple(about["quantities"])
         names = {"run_id": head.run_id, "session": head.session}
         n = len(columns["terrain"])
         parts.append({**columns, **{key: np.full(n, text, dtype=object) for key, text in names.items()}})
@@ -235,7 +243,12 @@ def _table(
     if np.array_equal(features, np.broadcast_to(features[:1], features.shape), equal_nan=True):
         raise DataError("no feature ever varies: nothing can be learned from them")
     repaired = dict(sum((Counter(head.repaired) for head in heads), Counter()))
-    samples = Samples(cut.windows, dict(cut.dropped), cut.windows.groups, rule.overlap, repaired=repaired)
+    observed = None
+    if quantities:
+        answers, q = table["answers"][known], len(quantities)
+        observed = Observed(quantities, answers[:, :q], answers[:, q:].reshape(len(answers), q, -1))
+    parts_of = cut.windows, dict(cut.dropped), cut.windows.groups, rule.overlap
+    samples = Samples(*parts_of, repaired=repaired, cached=observed)
     return samples, features, Motion(*(table[name][known] for name in Motion._fields))
 
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from features.answers import answers_of
 from features.extractor import FeatureExtractor
 from features.motion import NO_MOTION, window_motion
 from features.protocols import PROTOCOLS, Samples, folds_of, slow_and_fast
@@ -51,7 +50,7 @@ from terrain.classify.metrics import (
 )
 from terrain.classify.svm import GroupedSVC
 from terrain.errors import DataError
-from terrain.records import Array, Windows
+from terrain.records import Array
 
 CHECKED_WITH, BASELINE = FEATURE_RECIPE, "plain"
 """The recipe of the checks beside the figures: they are of the data, and have many fits; what a recipe must beat."""
@@ -156,7 +155,8 @@ def evaluate_recipe(
         _, checked = _of_svm(recipe, features, samples, settings)
         terrain, group, gap = samples.terrain, samples.group, samples.gap
         left_out = left_out_folds(terrain, group, N_FOLDS, gap, seed)
-        shared = _looks(windows, checked), terrain, group, gap, seed
+        end_s = windows.start_s + windows.length_s
+        shared = Looks(checked, samples.observed, end_s), terrain, group, gap, seed
         scores = [*parallel(score_fold, shared, left_out, settings.jobs, protocol, progress)]
         found |= unknown_figures(scores, terrain, group, windows.start_s, seed)
     elif not published and (settings.extras or channels):
@@ -217,12 +217,6 @@ def _of_svm(
     return recipe[-1], features
 
 
-def _looks(windows: Windows, features: Array) -> Looks:
-    """Return what shows whether the terrain of windows was learned; windows from a cache have no samples."""
-    observed = answers_of(windows) if windows.values else None
-    return Looks(features, observed, windows.start_s + windows.length_s)
-
-
 def _refusals(
     recipe: WindowPipeline,
     features: Array,
@@ -235,8 +229,9 @@ def _refusals(
     _, checked = _of_svm(recipe, features, samples, settings)
     terrain, group, rows = samples.terrain, samples.group, np.flatnonzero(held_out.tested)
     first = [each.fold for each in held_out.results if each.fold.repeat == 0]
+    end_s = samples.windows.start_s + samples.windows.length_s
     shared, refused = (
-        (_looks(samples.windows, checked), terrain, group, samples.gap, settings.seed),
+        (Looks(checked, samples.observed, end_s), terrain, group, samples.gap, settings.seed),
         np.zeros(len(terrain), dtype=bool),
     )
     folds = [(fold.train, fold.test) for fold in first]

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from features.answers import answers_of
 from features.extractor import FeatureExtractor
 from features.motion import window_motion
 from features.protocols import Samples, samples_of
@@ -158,8 +157,7 @@ def with_limits(
     except DataError as error:
         notes.append(f"no window is called unknown for its looks: {error}")
     try:
-        observed = answers_of(windows) if windows.values else None
-        if observed is None:
+        if (observed := samples.observed) is None:
             raise DataError("no wheel speed beside a yaw rate, a vibration, a current or a slip is at hand")
         answers = learn_answers(observed, terrain, samples.group, end_s, score, **dealt)
     except DataError as error:

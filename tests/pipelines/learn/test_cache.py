@@ -65,6 +65,9 @@ def test_cached_features_are_those_of_the_runs_bit_for_bit(runs_dir, cached):
             assert getattr(found.samples.windows, name).tolist() == getattr(samples.windows, name).tolist()
         for there, here in zip(found.motion, motion, strict=True):
             assert there.tobytes() == here.tobytes()
+        assert found.samples.observed.quantities == samples.observed.quantities
+        for there, here in zip(found.samples.observed[1:], samples.observed[1:], strict=True):
+            assert there.tobytes() == here.tobytes()
     assert cached(SETTINGS.with_(window_s=1.0))[2] == 8  # beside the first
     assert cached()[2] == 0
 

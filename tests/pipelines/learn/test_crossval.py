@@ -188,7 +188,9 @@ def test_a_terrain_left_out_has_areas_their_intervals_and_both_rates(drive_all, 
     rows = found.unknown_by_terrain.values()
     assert np.mean([row.auroc for row in rows]) == pytest.approx(found.auroc_unknown)
     assert found.auroc_unknown > 0.6  # the middle one of three terrains lies between the others
-    assert 0.8 < found.known_kept <= 1.0
+    assert (
+        0.7 < found.known_kept <= 1.0
+    )  # of five or six runs a new one is the most unlike in a sixth of cases
 
 
 def test_terrains_of_vulpi_are_classified_on_held_out_runs(datasets_dir, settings):
