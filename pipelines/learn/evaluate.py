@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,10 @@ from terrain.classify.held_out import (
 )
 from terrain.classify.limits import Motion
 from terrain.classify.metrics import (
+    Difference,
+    Outcome,
     RefusalFigures,
+    compare_outcomes,
     held_out_figures,
     learning_curve,
     refusal_figures,
@@ -49,8 +53,9 @@ from terrain.classify.metrics import (
     unknown_figures,
 )
 from terrain.classify.svm import GroupedSVC
+from terrain.classify.terrain_filter import choose_settings, filter_sessions, reported
 from terrain.errors import DataError
-from terrain.records import Array
+from terrain.records import Array, Windows
 
 CHECKED_WITH, BASELINE = FEATURE_RECIPE, "plain"
 """The recipe of the checks beside the figures: they are of the data, and have many fits; what a recipe must beat."""
@@ -164,6 +169,8 @@ def evaluate_recipe(
             found["refusals"] = _refusals(recipe, features, samples, held_out, settings, progress)
         except DataError as error:
             notes.append(f"no window is ever called unknown: {error}")
+    if not published and protocol not in ("leave-terrain-out", "slow-fast", "fast-slow"):
+        found["over_time"] = _over_time(held_out, windows, samples.unit, seed)
     if not published:
         found["conformal"] = set_figures(held_out, windows, samples.unit, seed)
         if motion is None:
@@ -215,6 +222,37 @@ def _of_svm(
         recipe = recipe_of(settings, CHECKED_WITH)
         features = feature_matrix(recipe, samples.windows)
     return recipe[-1], features
+
+
+def _over_time(held_out: HeldOut, windows: Windows, unit: Array, seed: int) -> Difference | None:
+    """Return the accuracy of the first fold assignment by single windows, and by the filter through runs or sessions.
+
+    The settings of each fold are those that its own training part chooses; None of a classifier without inner folds.
+    """
+    terrain, end_s, groups = held_out.truth, windows.start_s + windows.length_s, windows.groups
+    right = np.zeros((2, len(terrain)), dtype=bool)
+    for fold, probability, _, _, _, inner in held_out.results:
+        if fold.repeat or inner is None:
+            continue
+        train, test = fold.train, fold.test
+        classes, counts = np.unique(terrain[train], return_counts=True)
+        columns = np.searchsorted(held_out.classes, classes)
+        prior = dict(zip(classes.tolist(), (counts / counts.sum()).tolist(), strict=True))
+        fitted = SimpleNamespace(classes_=classes, inner_probability_=inner[:, columns])
+        of_training = terrain[train], end_s[train], groups[train], windows.length_s, prior
+        settings = choose_settings(fitted, *of_training)
+        right[:, test] = probability.argmax(axis=1) == np.searchsorted(held_out.classes, terrain[test])
+        if settings is not None:
+            along = end_s[test], groups[test], windows.length_s, settings
+            found = reported(filter_sessions(probability[:, columns], *along))
+            right[1, test] = (found >= 0) & (classes[found] == terrain[test])
+    rows = np.flatnonzero(held_out.tested)
+    if not right.any():
+        return None
+    single, filtered = (
+        Outcome(unit, terrain, each[None], np.ones((1, len(terrain)))).at(rows) for each in right
+    )
+    return compare_outcomes(single, filtered, np.random.default_rng(seed)).accuracy
 
 
 def _refusals(
@@ -276,6 +314,7 @@ def _extras(
         slow, fast = np.flatnonzero(side == "slow"), np.flatnonzero(side == "fast")
         both = accuracies(features, [Fold(0, 0, slow, fast), Fold(1, 0, fast, slow)], "slow to fast")
         slow_fast = slow_fast._replace(slow_to_fast=both[0], fast_to_slow=both[1])
+    unit = "session" if has_sessions(terrain, samples.group) else "run"
     drawn, runs_per_class = drawn_folds(terrain, samples.group, first, seed)
     curve = accuracies(features, drawn, "learning curve") if drawn else []
     tracks = [track for result in held_out.results for track in result.found or ()]
@@ -284,7 +323,7 @@ def _extras(
         "speed_only_accuracy": speed_only,
         "plain_accuracy": plain_accuracy,
         "slow_fast": slow_fast,
-        "learning_curve": learning_curve(runs_per_class, curve, full),
+        "learning_curve": learning_curve(runs_per_class, curve, full, unit),
         "courses": spliced,
         "recorded_courses": sequence_figures([track for track in tracks if not track.spliced], seed),
         "breakaways": breakaways(held_out, windows),

@@ -22,6 +22,7 @@ from terrain.classify.metrics import (
     ConformalFigures,
     CoverageFigures,
     DelayFigures,
+    Difference,
     FoldFigures,
     LearningCurve,
     LeftOutTerrain,
@@ -91,6 +92,9 @@ class CrossvalResult(Result):
     )
     slow_fast: SlowFast | None = optional("slow runs train and fast ones test, and the reverse")
     learning_curve: LearningCurve | None = optional("accuracy by number of training runs")
+    over_time: Difference | None = optional(
+        "accuracy of single windows and of the filter that goes on through a run or session, 'unknown' being wrong"
+    )
     filtered_accuracy: float | None = optional("accuracy of the filter over time", "1")
     filtered_accuracy_ci: tuple[float, float] | None = optional("interval of it", "1")
     filter_delay_s: DelayFigures | None = optional("from a change of terrain to its report", "s")
@@ -179,8 +183,17 @@ def report(result: CrossvalResult) -> Report:
     if curve is not None:
         decide += [
             *result.pairs("speed_only_accuracy", "plain_accuracy"),
-            ("number of runs", curve.statement),
+            (f"number of {result.unit}s", curve.statement),
         ]
+    if result.over_time is not None:
+        filtered, gain, (low, high) = (
+            result.over_time.b,
+            result.over_time.difference,
+            result.over_time.interval,
+        )
+        points = f"{100 * gain:+.1f} points, {100 * low:+.1f} to {100 * high:+.1f}"
+        text = f"{format_value(filtered, PERCENT)} ({points}, {result.over})"
+        decide.append((f"filtered through each {result.unit}", text))
     if (found := result.refusals) is not None:
         refused, ends, worst = (
             format_value(each, PERCENT) for each in (found.refused, found.refused_ci, found.worst_run)

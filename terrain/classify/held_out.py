@@ -40,7 +40,8 @@ class Examples(NamedTuple):
 class FoldResult(NamedTuple):
     """Held-out class probabilities of one fold, what inner folds chose, and what else was asked of its classifier.
 
-    ``conformal`` is the threshold of its sets of classes; NaN where its training part does not give one.
+    ``conformal`` is the threshold of its sets of classes; NaN where its training part does not give one.  ``inner``
+    (n_train, k) has the probabilities of its training rows while inner folds held them out, NaN where none did.
     """
 
     fold: Fold
@@ -48,6 +49,7 @@ class FoldResult(NamedTuple):
     chosen: Mapping[str, Any]
     found: Any = None
     conformal: float = math.nan
+    inner: Array | None = None
 
 
 def fit_fold(
@@ -73,14 +75,16 @@ def fit_fold(
         probability[:, np.searchsorted(classes, fitted.classes_)] = fitted.predict_proba(features[test])
     best = getattr(fitted, "best_", None)
     chosen = {} if best is None else dict(best._asdict())
-    threshold = math.nan
+    threshold, inner = math.nan, None
     if hasattr(fitted, "inner_probability_"):
+        inner = np.zeros((len(train), len(classes)))
+        inner[:, np.searchsorted(classes, fitted.classes_)] = fitted.inner_probability_
         try:
             scores = held_out_scores(fitted, terrain[train])
             threshold = conformal_threshold(scores, units_of(terrain[train], group[train]))
         except DataError:
             pass
-    return FoldResult(fold, probability, chosen, None if ask is None else ask(fitted), threshold)
+    return FoldResult(fold, probability, chosen, None if ask is None else ask(fitted), threshold, inner)
 
 
 def itself(fitted: Any) -> Any:
@@ -138,14 +142,14 @@ CURVE_DRAWS = 2
 
 
 def drawn_folds(y: Array, group: Array, folds: Sequence[Fold], seed: int) -> tuple[list[Fold], Array]:
-    """Draw at most m training runs of each class, for each m of :data:`CURVE_RUNS`; test rows stay the same.
+    """Draw at most m training runs (or sessions) of each class, for each m of :data:`CURVE_RUNS`, not test rows.
 
     Returns
     -------
     folds : :data:`CURVE_DRAWS` repeats a size, of folds of one repeat
     runs_per_class : of each size, and of all runs
     """
-    group = run_of(group)
+    group = units_of(y, group)
     available = [
         np.array([len(set(group[train][y[train] == name])) for name in np.unique(y[train])])
         for _, _, train, _ in folds

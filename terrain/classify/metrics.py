@@ -853,17 +853,19 @@ class LearningCurve(NamedTuple):
     statement: str  #: the same in a sentence
 
 
-def learning_curve(runs_per_class: Array, drawn: Sequence[float], full: float) -> LearningCurve:
-    """Return the curve of accuracies of drawn folds, in their order, and that of all runs."""
+def learning_curve(
+    runs_per_class: Array, drawn: Sequence[float], full: float, unit: str = "run"
+) -> LearningCurve:
+    """Return the curve of accuracies of drawn folds, in their order, and that of all runs, or what the unit is."""
     by_size = np.reshape(drawn, (-1, CURVE_DRAWS))
     accuracy = np.append(by_size.mean(axis=1), full)
     spread = (*by_size.std(axis=1, ddof=1).tolist(), None)
-    enough = enough_runs(runs_per_class, accuracy)
+    enough = enough_runs(runs_per_class, accuracy, unit)
     return LearningCurve(tuple(runs_per_class.tolist()), tuple(accuracy.tolist()), spread, *enough)
 
 
-def enough_runs(runs_per_class: Array, accuracy: Array) -> tuple[int | None, str]:
-    """Return how many runs of each class would be enough by the law ``accuracy(m) = a - b m^-c``, and a sentence.
+def enough_runs(runs_per_class: Array, accuracy: Array, unit: str = "run") -> tuple[int | None, str]:
+    """Return how many units a class would be enough by the law ``accuracy(m) = a - b m^-c``, and a sentence.
 
     Enough is the smallest whole m for which doubling gains less than :data:`ENOUGH_GAIN` by that law; it
     is not sought beyond ten times the largest m that was measured, and is None beyond, or with fewer than four points.
@@ -875,7 +877,7 @@ def enough_runs(runs_per_class: Array, accuracy: Array) -> tuple[int | None, str
     16
     """
     if len(accuracy) < MIN_CURVE_POINTS:
-        return None, f"{len(accuracy)} sizes are too few to estimate how many runs are enough"
+        return None, f"{len(accuracy)} sizes are too few to estimate how many {unit}s are enough"
     fit = least_squares(
         lambda p: p[0] - p[1] * runs_per_class ** -p[2] - accuracy,
         x0=[min(accuracy.max() + 0.02, 1.0), 0.3, 0.7],
@@ -888,11 +890,11 @@ def enough_runs(runs_per_class: Array, accuracy: Array) -> tuple[int | None, str
     slack = f"{100 * float(np.interp(largest, sizes, gain)):.1f}\N{NO-BREAK SPACE}%"
     found = sizes[gain < ENOUGH_GAIN]
     if not len(found):
-        return None, f"not enough yet: doubling the {largest:.1f} runs per class would still gain {slack}"
+        return None, f"not enough yet: doubling the {largest:.1f} {unit}s per class would still gain {slack}"
     enough = int(found[0])
     return enough, (
         f"{'enough' if enough <= largest else 'not enough yet'}: "
-        f"{enough} {'run' if enough == 1 else 'runs'} per class would be enough "
+        f"{enough} {unit}{'' if enough == 1 else 's'} per class would be enough "
         f"(doubling them gains under {100 * ENOUGH_GAIN:.0f}\N{NO-BREAK SPACE}%); "
         f"the data have {largest:.1f} on average, doubling which would gain {slack}"
     )
