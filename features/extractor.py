@@ -463,6 +463,11 @@ class Window:
 WindowFunction = Callable[[Window], float | Mapping[str, float]]
 
 
+def function_name(function: WindowFunction) -> str:
+    """Return the name of a function, or of the class of an object that is called as one."""
+    return str(getattr(function, "__name__", type(function).__name__))
+
+
 @dataclass(eq=False, repr=False)
 class FunctionExtractor(FeatureExtractor):
     """Turn windows into features and, in the last columns, what a user's own functions give for each window.
@@ -517,7 +522,7 @@ class FunctionExtractor(FeatureExtractor):
         place = f"the window of run {windows.run_id[row]} at {windows.start_s[row]:.2f} s"
         numbers: dict[str, float] = {}
         for function in self.functions:
-            name = str(getattr(function, "__name__", type(function).__name__))
+            name = function_name(function)
             try:
                 given = function(window)
             except Exception as error:

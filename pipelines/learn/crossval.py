@@ -123,8 +123,9 @@ def cross_validate(
     ...     return np.abs(window["imu", "accel_z_mps2"]).max()
     >>> found = cross_validate(KNeighborsClassifier(3), windows, functions=[peak], repeats=1, n_jobs=1)
     >>> found.recipe, found.n_features, found.accuracy
-    ('KNeighborsClassifier', 52, 1.0)
+    ('KNeighborsClassifier with peak', 52, 1.0)
     """
+    from features.extractor import function_name
     from features.protocols import Samples
     from features.recipes import make_recipe
     from features.windows import overlap_of
@@ -144,5 +145,7 @@ def cross_validate(
             kind, made = each.recipe, each.unfitted(gap)
         else:
             made = make_recipe(each, settings.signal_sets, gap=gap, seed=settings.seed, functions=functions)
-        contenders.append((kind if isinstance(kind, str) else type(kind).__name__, made, samples))
+        name, own = kind if isinstance(kind, str) else type(kind).__name__, getattr(made[0], "functions", ())
+        name += f" with {', '.join(map(function_name, own))}" if own else ""
+        contenders.append((name, made, samples))
     return side_by_side(contenders, settings, progress)

@@ -146,7 +146,8 @@ class OwnClassifier(GroupedClassifier):
         if held_out and self.outputs == "decision_function":
             margins = np.concatenate([each for _, each in held_out])
             truth = y[np.concatenate([rows for rows, _ in held_out])]
-            self.calibration_ = LogisticRegression().fit(margins, truth)
+            self.margin_std_ = float(margins.std()) or 1.0  # whatever the unit of margins is
+            self.calibration_ = LogisticRegression().fit(margins / self.margin_std_, truth)
         self.inner_probability_ = np.full((len(y), len(self.classes_)), np.nan)
         for rows, each in held_out:
             self.inner_probability_[rows] = self._probability(each)
@@ -173,6 +174,6 @@ class OwnClassifier(GroupedClassifier):
         if self.outputs != "decision_function":
             return outputs
         if self.calibration_ is not None:
-            return np.asarray(self.calibration_.predict_proba(outputs))
+            return np.asarray(self.calibration_.predict_proba(outputs / self.margin_std_))
         best = outputs.argmax(axis=1) if outputs.shape[1] > 1 else (outputs[:, 0] > 0).astype(int)
         return np.asarray(best[:, None] == np.arange(len(self.classes_)), dtype=float)
