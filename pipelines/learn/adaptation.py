@@ -9,7 +9,6 @@ import numpy as np
 from scipy.stats import t as student
 from sklearn.linear_model import LogisticRegression
 
-from features.windows import join_windows
 from terrain.classify.adaptation import (
     START_S,
     Adaptation,
@@ -90,11 +89,9 @@ def judged_adaptation(
                 if not len(rest):
                     continue
                 shifted = adapt(law, windows[own[start]])
-                values, weights = zip(*corrections(shifted), strict=True)
-                each = extract(join_windows([corrected(shifted, windows[rest], value) for value in values]))
-                averaged = np.einsum(
-                    "ink,ik->nk", probability(each).reshape(len(values), len(rest), -1), np.array(weights)
-                )
+                values, weights = corrections(shifted)
+                each = probability(extract(corrected(shifted, windows[rest], values)))
+                averaged = np.einsum("ink,ik->nk", each.reshape(len(values), len(rest), -1), weights)
                 truth = np.searchsorted(judge.classes_, y[rest])
                 pair = probability(features[rest]), averaged / averaged.sum(axis=1, keepdims=True)
                 losses.append(

@@ -185,6 +185,8 @@ def with_limits(
         adaptation = judged_adaptation(
             samples.windows, features, recipe[0].features_of, samples.gap, info.seed
         )
+        used = "is used" if adaptation.shown else "waits for --adapt"
+        notes.append(f"adapting to a session {used}: that it helps is {adaptation.status}")
     except DataError as error:
         notes.append(f"no adapting to a session: {error}")
     return TerrainModel(recipe, info, novelty, support, None, adaptation, answers), tuple(notes)

@@ -280,9 +280,8 @@ def _outputs(model: TerrainModel, windows: Windows) -> tuple[Array, Array]:
     """
     recipe, n, of_terrain = model.recipe, len(windows), None
     if model.adaptation is not None and model.adaptation.shift is not None:
-        values, weights = zip(*corrections(model.adaptation), strict=True)
-        windows = join_windows([corrected(model.adaptation, windows, theta) for theta in values])
-        of_terrain = np.array(weights)
+        values, of_terrain = corrections(model.adaptation)
+        windows = corrected(model.adaptation, windows, values)
     features = novelty = None
     if model.novelty is not None:
         features = recipe[0].features_of(windows)
@@ -294,9 +293,9 @@ def _outputs(model: TerrainModel, windows: Windows) -> tuple[Array, Array]:
     if of_terrain is not None:
         probability = np.einsum("ink,ik->nk", probability.reshape(-1, n, probability.shape[1]), of_terrain)
         probability /= probability.sum(axis=1, keepdims=True)
-        first = (of_terrain > 0.0).argmax(axis=0)  # of each terrain's corrections
         if novelty is not None:
-            novelty = novelty.reshape(-1, n)[first[probability.argmax(axis=1)], np.arange(n)]
+            first = (of_terrain > 0.0).argmax(axis=0)[probability.argmax(axis=1)]
+            novelty = novelty.reshape(-1, n)[first, np.arange(n)]
     return probability, np.full(n, np.nan) if novelty is None else novelty
 
 
