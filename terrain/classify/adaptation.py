@@ -47,8 +47,8 @@ MIN_REFERENCE_S = 5.0
 START_S = 20.0  #: The start of a session that is taken for a reference.
 CERTAIN = 0.7
 """Of an adapted model: where no terrain is more probable, it is unknown.  Chosen on runs of the Robotino's one session,
-in those held out of which currents of 0.9 to 1.4 times their values and offsets were hidden: 4 to 7 % of windows are then
-wrong and not unknown (14 to 17 % as trained), at 0.6 it is 8 to 11 %."""
+in those held out of which currents of 0.9 to 1.4 times their values and offsets were hidden: 4 to 7 % of windows are
+then wrong and not unknown (14 to 17 % as trained), at 0.6 it is 8 to 11 %."""
 
 WIDTHS = (0.1, 0.2, 0.4)  #: Of "driven nearly alike", among which held-out runs choose.
 MAX_ROWS = 400  #: Training windows of a ground and session that are kept, thinned evenly.
@@ -270,7 +270,7 @@ def start_of(windows: Windows) -> Array:
 def corrections(adaptation: Adaptation) -> tuple[Array, Array]:
     """Return values of theta (p, d) that remain possible, and the weight of each for each terrain (p, k).
 
-    Those of a terrain have the mean and the covariance of its theta, the mean first; without a shift there is one, zero.
+    Those of a terrain have the mean and the covariance of its theta, the mean first; without a shift it is zero, alone.
     """
     k, d, shift = len(adaptation.classes), len(adaptation.parameters), adaptation.shift
     if shift is None:
