@@ -153,6 +153,7 @@ def with_limits(
         terms = held_out_terms(features, terrain, samples.group, **dealt)
         novelty = learn_novelty(features, terrain, samples.group, **dealt, terms=terms)
         score = fisher_scores(novelty.reference, terms)
+        # of looks alone: together with answers as many known windows are called unknown
         evidence = novelty_evidence(score, score > novelty.threshold)
     except DataError as error:
         notes.append(f"no window is called unknown for its looks: {error}")
