@@ -16,6 +16,8 @@ mean circumferential speeds l and r of the two sides, ``m = (l + r) / 2`` and ``
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from features.windows import rows_of_sets, wheel_stream
@@ -81,12 +83,11 @@ def answers_of(windows: Windows) -> Observed | None:
             if (rows := [i for i, name in enumerate(channels) if name.startswith(quantities)])
         }
         if "imu" in sets and bands and shaken:
-            taper = np.hanning(values.shape[2])
+            taper, of_bands = _spectrum(values.shape[2], rate_hz)
             lines = np.fft.rfft((values - values.mean(axis=2, keepdims=True)) * taper, axis=2)
-            power = (lines.real**2 + lines.imag**2) * (2.0 / (len(taper) * (taper @ taper)))
-            hz = np.fft.rfftfreq(len(taper), 1.0 / rate_hz)
-            for low, high in bands:
-                within = power[:, :, (hz >= low) & (hz < high)].sum(axis=2)
+            power = lines.real**2 + lines.imag**2
+            for (low, high), band in zip(bands, of_bands, strict=False):
+                within = power[:, :, band].sum(axis=2)
                 for kind, rows in shaken.items():
                     name = f"shake, {kind}, {low:g} to {high:g} Hz"
                     found[name] = 0.5 * np.log10(within[:, rows].sum(axis=1) + MIN_POWER), shaking
@@ -118,3 +119,11 @@ def answers_of(windows: Windows) -> Observed | None:
     for number, (_, of) in enumerate(found.values()):
         driving[:, number, : len(of)] = np.column_stack(of)
     return Observed(tuple(found), np.column_stack([response for response, _ in found.values()]), driving)
+
+
+@lru_cache(maxsize=64)
+def _spectrum(n: int, rate_hz: float) -> tuple[Array, list[slice]]:
+    """Return the taper (n,), scaled so that squared lines add up to a variance, and the lines of each band."""
+    taper, hz = np.hanning(n), np.fft.rfftfreq(n, 1.0 / rate_hz)
+    bands = [slice(*np.searchsorted(hz, band).tolist()) for band in BANDS_HZ]
+    return taper * np.sqrt(2.0 / (n * (taper @ taper))), bands

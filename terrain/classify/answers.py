@@ -267,9 +267,9 @@ def rarities(reference: Array, scores: Array) -> Array:
     """
     out = np.zeros(scores.shape)
     for j in range(scores.shape[1]):
-        column = reference[np.isfinite(reference[:, j]), j]
-        n_above = len(column) - np.searchsorted(column, scores[:, j])
-        rarity = np.log(len(column) + 1) - np.log(n_above + 1)
+        n_known = int(np.isfinite(reference[:, j]).sum())  # NaN is last in order
+        n_above = n_known - np.searchsorted(reference[:n_known, j], scores[:, j])
+        rarity = np.log(n_known + 1) - np.log(n_above + 1)
         out[:, j] = np.where(np.isfinite(scores[:, j]), rarity, 0.0)
     return out
 
