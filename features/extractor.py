@@ -144,6 +144,37 @@ def speed_features(
     return features, np.stack(columns, axis=1) if columns else np.empty((n, 0))
 
 
+def slip_features(
+    values: Mapping[str, Array], channels: Mapping[str, Sequence[str]]
+) -> tuple[list[Feature], Array]:
+    """Return how far wheels slip that drive and that brake, (n_windows, n_features); none without their slip and speed.
+
+    With the mean slip s_i of a wheel, positive where it drives ahead or back, ``traction = max_i s_i``, ``braking =
+    min_i s_i``, and ``scatter`` is the root mean square of the wheels' standard deviations: in a curve the outer wheels
+    of a skid-steer robot drive and the inner ones brake, so that these do not depend on the side.
+    """
+    wheel, n = wheel_stream(channels), len(next(iter(values.values())))
+    speeds = [] if wheel is None else list(channels[wheel])
+    names = [name[5:-6] for name in channels.get("slip", ()) if f"speed_{name[5:-6]}_mps" in speeds]
+    if wheel is None or not names:
+        return [], np.empty((n, 0))
+    turning = values[wheel][:, [speeds.index(f"speed_{name}_mps") for name in names]].mean(axis=2)
+    rows = [channels["slip"].index(f"slip_{name}_ratio") for name in names]
+    mean, std = slip_statistics(values["slip"][:, rows])[:, :, :2].transpose(2, 0, 1)
+    driven = np.where(turning < 0.0, -mean, mean)
+    some = np.isfinite(driven).any(axis=1)
+    table = np.full((n, 3), np.nan)
+    table[some] = np.column_stack(
+        [
+            np.nanmax(driven[some], axis=1),
+            np.nanmin(driven[some], axis=1),
+            np.sqrt(np.nanmean(std[some] ** 2, axis=1)),
+        ]
+    )
+    sets = frozenset({"slip", "wheels"})
+    return [Feature(f"slip.{name}", "1", sets) for name in ("traction", "braking", "scatter")], table
+
+
 def left_out_of(stream: str, channel: str) -> frozenset[str]:
     """Return the statistics of a channel that are computed on request only."""
     signal_set = signal_set_of(stream, channel) or ""
@@ -288,9 +319,11 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
                 parts.append(channel_correlations(values[:, rows]))
                 features += _pairs(stream, tuple(names[i] for i in rows), signal_set)
         if selected:
-            of_speed = speed_features(selected, self.layout_.channels)
-            features += of_speed[0]
-            parts.append(of_speed[1])
+            for made, table in (
+                of(selected, self.layout_.channels) for of in (speed_features, slip_features)
+            ):
+                features += made
+                parts.append(table)
         return features, np.concatenate(parts, axis=1)
 
     def selected(self, X: Windows) -> dict[str, Array]:

@@ -36,7 +36,7 @@ SLIP_STATISTICS: tuple[tuple[str, str], ...] = tuple(
     (name, "1") for name in ("mean", "std", "min", "max", "mean_abs", "median")
 )
 
-MIN_DEFINED_FRACTION = 0.5  #: With a smaller fraction of the window defined, its slip statistics are NaN.
+MIN_DEFINED_FRACTION = 0.2  #: With a smaller fraction of the window defined, its slip statistics are NaN.
 MAX_BANDS, MIN_BINS_PER_BAND = 20, 2
 MIN_SAMPLES = 48  #: A spectrum of fewer samples has too few lines to add anything to the autocorrelation.
 ROLLOFF = 0.85
@@ -256,11 +256,11 @@ def _describe(power: Array, log_power: Array, edges: Array, resolution_hz: float
 def slip_statistics(slip_ratio: Array) -> Array:
     """Return the :data:`SLIP_STATISTICS` (n_windows, wheels, 6) of slip (n_windows, wheels, n_samples).
 
-    Slip is not finite where it is undefined; of a window of which over half is, all are NaN.
+    Slip is not finite where it is undefined; of a window of which under a fifth is defined, all are NaN.
 
     Examples
     --------
-    >>> slip_statistics(np.array([[[0.1, np.nan, 0.3]], [[np.nan, np.nan, 0.3]]]))[:, 0, 0].round(3)
+    >>> slip_statistics(np.array([[[0.1, np.nan, 0.3]], [[np.nan] * 3]]))[:, 0, 0].round(3)
     array([0.2, nan])
     """
     slip_ratio = np.where(np.isfinite(slip_ratio), slip_ratio, np.nan)

@@ -71,7 +71,7 @@ from terrain.kinematics.camera import body_motion
 from terrain.kinematics.logged_wheels import speed_columns
 from terrain.kinematics.wheels import no_slip_twist, point_velocity, rolling_matrix, wheel_frame_velocities
 from terrain.logs.schema import POSE_CHANNELS, TWIST
-from terrain.records import Array, RunLog, SlipTrack
+from terrain.records import Array, RunLog, SlipTrack, Stream
 from terrain.robots import Robot, robot_named
 from terrain.signals import Delay, DelayStatus, common_delay
 from terrain.slip import slip_ratio
@@ -278,6 +278,13 @@ standard deviations, are no steady motion."""
 
 MIN_SAMPLES = 6
 COVERAGE = 0.8  #: Of a window, by samples of either stream
+#: Of the short windows of a stream of slip: a lidar that misses half of its scans leaves parts of 0.25 s.
+STREAM_SAMPLES, STREAM_COVERAGE = 3, 0.3
+
+
+#: Slip of the body, its speed across the direction of the wheels over the faster of both speeds, and its yaw rate over
+#: that of the wheels, NaN where these do not turn it.
+BODY_CHANNELS = ("slip_body_ratio", "slip_side_ratio", "slip_turn_ratio")
 
 
 class MeasuredSlip(NamedTuple):
@@ -318,6 +325,16 @@ class MeasuredSlip(NamedTuple):
         """The slips of the wheels, at the middle of each window."""
         return SlipTrack(self.time_s, self.slip_ratio, self.slip_std, self.wheels)
 
+    @property
+    def stream(self) -> Stream:
+        """The stream ``slip`` of a run log: of the wheels, and :data:`BODY_CHANNELS`, at the middle of each window."""
+        turned, rolled = self.twist[:, 2], self.rolled_twist[:, 2]
+        turns = np.abs(rolled) >= MIN_TURN_RADPS  # False for NaN
+        ratio = np.divide(turned, rolled, out=np.full(turned.shape, np.nan), where=turns)
+        of_wheels = self.track.as_stream()
+        values = [of_wheels.values, np.column_stack([self.body_slip, self.body_side, ratio])]
+        return Stream(self.time_s, np.hstack(values), (*of_wheels.channels, *BODY_CHANNELS))
+
 
 def measured_slip(
     run: RunLog,
@@ -336,8 +353,8 @@ def measured_slip(
     robot : whose log it is, of any drive
     window_s, stride_s : length of the windows, and from one to the next
     delay_s : of the outside measurement behind the wheels
-    whole : windows over all that the wheels were logged, NaN where the motion was not measured; by default
-        they begin and end where both were
+    whole : windows about each time from the first to the last sample of the wheels, as a stream of slip has them, NaN
+        where the motion was not measured; by default they begin and end where both were
 
     Raises
     ------
@@ -356,6 +373,8 @@ def measured_slip(
             f"run {run.run_id}: has {len(outside_s)} samples measured from outside, two are needed"
         )
     begin_s, last_s = max(time_s[0], outside_s[0]), min(time_s[-1], outside_s[-1]) - window_s
+    if whole:
+        begin_s, last_s = begin_s - window_s / 2, last_s + window_s / 2
     if last_s < begin_s - 0.02 * window_s:
         raise DataError(
             f"run {run.run_id}: wheels and outside measurement share {max(last_s + window_s - begin_s, 0.0):.2f} "
@@ -363,7 +382,8 @@ def measured_slip(
         )
     n = max(int(np.floor((last_s - begin_s) / stride_s + 1e-6)) + 1, 1)
     start_s = begin_s + stride_s * np.arange(n)
-    end_s, rolled, enough = start_s + window_s, _rolled(time_s, speeds), (MIN_SAMPLES, COVERAGE)
+    end_s, rolled = start_s + window_s, _rolled(time_s, speeds)
+    enough = (STREAM_SAMPLES, STREAM_COVERAGE) if whole else (MIN_SAMPLES, COVERAGE)
     u, u_std = window_rates(*rolled, start_s, end_s, *enough)
     twist, twist_std = window_rates(path.time_s, path.values, path.part, start_s, end_s, *enough)
     place_m, direction = robot.wheel_positions_m, wheel_directions(run, robot, start_s, end_s)

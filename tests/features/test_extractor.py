@@ -5,7 +5,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
 
-from features.extractor import FeatureExtractor, SampleExtractor, derived_channels, speed_features
+from features.extractor import (
+    FeatureExtractor,
+    SampleExtractor,
+    derived_channels,
+    slip_features,
+    speed_features,
+)
 from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Windows
@@ -142,6 +148,29 @@ def test_per_speed_features_match_their_definitions():
     for name in slow:
         if not name.startswith("turning"):
             np.testing.assert_allclose(backwards[name], slow[name])
+
+
+def test_slip_features_tell_driving_from_braking_wheels_whichever_side_and_direction():
+    rng = np.random.default_rng(0)
+    wheels = np.stack([np.full((6, 20), 0.4), np.full((6, 20), 0.8)], axis=1)
+    slip = np.array([-0.2, 0.3])[:, None] + 0.02 * rng.standard_normal((6, 2, 40))  # the outer wheel drives
+    slip[1, 0], slip[2] = np.nan, np.nan
+    names = ("speed_left_mps", "speed_right_mps"), ("slip_left_ratio", "slip_right_ratio", "slip_body_ratio")
+
+    def table(wheels, slip):
+        body = np.full((6, 1, 40), 9.0)  # of the body: no wheel's
+        values = {"wheels": wheels, "slip": np.concatenate([slip, body], axis=1)}
+        features, found = slip_features(values, dict(zip(values, names, strict=True)))
+        assert [each.name for each in features] == ["slip.traction", "slip.braking", "slip.scatter"]
+        return found
+
+    found = table(wheels, slip)
+    np.testing.assert_allclose(found[[0, 3, 4, 5]], np.tile([0.3, -0.2, 0.02], (4, 1)), atol=0.01)
+    assert found[1] == pytest.approx([0.3, 0.3, 0.02], abs=0.01)  # of one wheel alone
+    assert np.isnan(found[2]).all()
+    np.testing.assert_array_equal(table(wheels[:, ::-1], slip[:, ::-1]), found)
+    np.testing.assert_allclose(table(-wheels, -slip), found)
+    assert slip_features({"wheels": wheels}, {"wheels": names[0]})[1].shape == (6, 0)
 
 
 def test_norms_do_not_see_how_the_sensor_is_mounted():

@@ -21,6 +21,7 @@ STUDIES = {
     "intervals": "coverage of the intervals of all that is identified",
     "labels": "what chosen questions and self-training gain, from few labels",
     "trials": "hide effects in simulated runs, diagnose them blindly, count what is right",
+    "ablation": "what each signal set is worth to the classifier, on all labelled sets",
     "live": "latency of the live chain by stage, and of the service with many robots",
     "soak": "the service for minutes or hours under robots that misbehave at random",
     "scale": "features of ever more runs with ever more processes: time and memory",

@@ -14,10 +14,11 @@ import pytest
 
 from pipelines.report.results import Result
 from pipelines.report.tree import Report
-from studies import consistency, figures, intervals, labels, long_drives, mutants, scale, trials
+from studies import ablation, consistency, figures, intervals, labels, long_drives, mutants, scale, trials
 from studies.__main__ import STUDIES, main
 from studies.blind_trials.trial import Row
 from terrain.errors import ConfigError, DataError
+from terrain.logs.schema import SIGNAL_SETS
 from terrain.robots import load_robot
 
 ROOT = Path(__file__).parents[2]
@@ -235,6 +236,27 @@ def test_label_strategies_are_compared_on_held_out_runs(tmp_path):
     assert first == 4.0
     assert min(others) >= 2 * first
     assert "points against as many drawn" in found.report.answer
+
+
+@pytest.mark.slow
+def test_a_signal_set_that_tells_terrains_is_worth_what_is_lost_without_it(tmp_path, monkeypatch, runs):
+    """Of drawn runs whose terrain is in the IMU, paired by run; a set that is not there is refused."""
+    from terrain.logs.run_folders import write_run
+
+    for run in runs:
+        write_run(run, tmp_path / "drawn")
+    monkeypatch.setitem(ablation.SETS, "drawn", ablation.Source({"drawn": "husky"}, "skid"))
+    asked = ablation.Settings(data=tmp_path, sets=("drawn",), recipes=("svm",), repeats=1, n_jobs=1)
+    found = ablation.run(asked)
+    assert found.units == {"drawn": "144 windows of 12 runs"}
+    rows = {row.signals: row.found for row in found.rows}
+    assert set(rows) == {"plain", *(f"without {name}" for name in SIGNAL_SETS)}
+    assert len({row.a for row in rows.values()}) == 1
+    assert rows["without imu"].difference < -0.1
+    assert rows["without slip"].difference == 0.0  # it is NaN of a robot that nothing measures from outside
+    assert "points on drawn (svm)" in found.report.answer
+    with pytest.raises(ConfigError, match="there is no set 'moon'; there are borealtc, vulpi, "):
+        ablation.run(ablation.Settings(sets=("moon",)))
 
 
 def test_what_is_not_accepted_is_exit_code_1(monkeypatch):

@@ -9,6 +9,7 @@ import pytest
 from pipelines.data.datasets import load_runs
 from pipelines.slip.estimate import estimate_runs
 from pipelines.slip.learn_slip import learn_slip_table
+from pipelines.slip.measured import SHORT_STRIDE_S
 from terrain.control.learned_table import FEW_RUNS, NO_PEAK
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
@@ -19,6 +20,7 @@ from terrain.records import Label, RunLog, Stream, TargetStatus
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 from terrain.slip_learning.ground_changes import MAX_DELAY_S
+from terrain.slip_learning.measured import BODY_CHANNELS, measured_slip
 
 ROBOTINO = load_robot("robotino")
 LENGTH_S = 9.0
@@ -124,6 +126,24 @@ def test_what_cannot_be_measured_is_refused_in_one_sentence(one_ground):
             measured_slips(runs, **options)
 
 
+def test_the_stream_has_the_slip_of_the_body_and_what_it_turns_also_where_a_lidar_misses_scans():
+    """A skid-steer robot whose slip ahead, drift aside and loss of turning are known."""
+    robot, time_s = load_robot("husky"), np.arange(0.0, 12.0, 0.05)
+    rolled = np.column_stack([np.full(time_s.size, 0.8), np.full(time_s.size, 0.4)])  # right and left wheels
+    ahead_mps, turn_radps = 0.6, 0.4 / robot.track_m
+    twist = np.tile([0.9 * ahead_mps, 0.06, 0.5 * turn_radps], (time_s.size, 1))
+    twist[time_s % 0.5 > 0.24] = np.nan
+    streams = {
+        "wheels": Stream(time_s, rolled, ("speed_right_mps", "speed_left_mps")),
+        "lidar": Stream(time_s, twist, ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")),
+    }
+    slip = measured_slip(RunLog("a", "husky", streams), robot, window_s=0.5, stride_s=0.1, whole=True).stream
+    known = np.isfinite(slip.values).all(axis=1)
+    assert known.mean() > 0.5
+    found = slip.columns(BODY_CHANNELS)[known]
+    np.testing.assert_allclose(found, np.tile([0.1, 0.1, 0.5], (len(found), 1)), atol=1e-6)
+
+
 def test_the_command_writes_result_runs_and_pictures(terrain, place, one_ground):
     for run in one_ground[::2]:
         write_run(run, place / "one")
@@ -134,9 +154,13 @@ def test_the_command_writes_result_runs_and_pictures(terrain, place, one_ground)
     document = json.loads((place / "slip.json").read_text(encoding="utf-8"))
     assert document["surfaces"][1]["slip_ratio"] == pytest.approx(0.4, abs=0.01)
     assert document["figures"][0].endswith("slip_by_surface.png")
-    slip = load_runs(place / "out")[0].streams["slip"]
-    assert slip.channels == ("slip_1_ratio", "slip_2_ratio", "slip_3_ratio")
-    assert np.nanmedian(np.abs(slip.values)) == pytest.approx(0.1, abs=0.03)
+    (run, *_), wheels = load_runs(place / "out"), ("slip_1_ratio", "slip_2_ratio", "slip_3_ratio")
+    slip, log = run.streams["slip"], run.streams["wheels"]
+    assert (slip.channels, run.filter) == ((*wheels, *BODY_CHANNELS), "pose")
+    assert np.nanmedian(np.abs(slip.columns(wheels))) == pytest.approx(0.1, abs=0.03)
+    # it covers the run, so that no window is lost to it
+    assert slip.time_s[0] == pytest.approx(log.time_s[0])
+    assert log.time_s[-1] - slip.time_s[-1] < SHORT_STRIDE_S
     assert "is there already" in terrain(*words)[2]
 
 
