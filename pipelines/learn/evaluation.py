@@ -102,7 +102,7 @@ class CrossvalResult(Result):
     recorded_courses: SequenceFigures | None = optional("runs over several terrains")
     breakaways: tuple[Breakaway, ...] | None = optional("stretches that look unlike their run")
     auroc_unknown: float | None = optional(
-        "area of the novelty score of a terrain never learned", "1", form=".3f"
+        "area of the score of how unlike learned terrains one is that was never learned", "1", form=".3f"
     )
     auroc_unknown_ci: tuple[float, float] | None = optional("interval of it", "1", form=".3f")
     auroc_unknown_10s: float | None = optional("the same of means over 10 s", "1", form=".3f")
