@@ -236,7 +236,7 @@ def assess(model: TerrainModel, windows: Windows, recent: Recent | None = None) 
         if the windows are not those that the model requires.
     """
     answers = supported = np.full(len(windows), np.nan)
-    probability, novelty = _outputs(model, windows)
+    probability, novelty, windows = _outputs(model, windows)
     unknown, misfits = np.zeros(len(windows), dtype=bool), np.zeros((len(windows), 0, 0))
     if model.novelty is not None:
         unknown = ~(novelty <= model.novelty.threshold)
@@ -272,11 +272,11 @@ def assess(model: TerrainModel, windows: Windows, recent: Recent | None = None) 
     return Assessed(probability, novelty, unknown, supported, answers, reason, misfits)
 
 
-def _outputs(model: TerrainModel, windows: Windows) -> tuple[Array, Array]:
-    """Return probabilities (n, k) and the score of novelty (n,), NaN without one.
+def _outputs(model: TerrainModel, windows: Windows) -> tuple[Array, Array, Windows]:
+    """Return probabilities (n, k), the score of novelty (n,), NaN without one, and the windows.
 
-    Of an adapted model, probabilities are averages over the corrections that are possible, and novelty is that of the
-    window as the most likely correction for its most probable terrain has it.
+    Of an adapted model, probabilities are averages over the corrections that are possible, and windows, with their
+    novelty, are as the most likely correction for their most probable terrain has them.
     """
     recipe, n, of_terrain = model.recipe, len(windows), None
     if model.adaptation is not None and model.adaptation.shift is not None:
@@ -293,10 +293,9 @@ def _outputs(model: TerrainModel, windows: Windows) -> tuple[Array, Array]:
     if of_terrain is not None:
         probability = np.einsum("ink,ik->nk", probability.reshape(-1, n, probability.shape[1]), of_terrain)
         probability /= probability.sum(axis=1, keepdims=True)
-        if novelty is not None:
-            first = (of_terrain > 0.0).argmax(axis=0)[probability.argmax(axis=1)]
-            novelty = novelty.reshape(-1, n)[first, np.arange(n)]
-    return probability, np.full(n, np.nan) if novelty is None else novelty
+        row = (of_terrain > 0.0).argmax(axis=0)[probability.argmax(axis=1)] * n + np.arange(n)
+        windows, novelty = windows[row], None if novelty is None else novelty[row]
+    return probability, np.full(n, np.nan) if novelty is None else novelty, windows
 
 
 def class_sets(model: TerrainModel, probability: Array) -> list[tuple[str, ...]] | None:
