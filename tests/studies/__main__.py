@@ -19,6 +19,7 @@ STUDIES = {
     "consistency": "NEES and coverage of slip by terrain, over simulated runs",
     "long-drives": "yaw of a filter on long drives, and after the loss of the camera",
     "intervals": "coverage of the intervals of all that is identified",
+    "adaptation": "what adapting to a session gives, by changes hidden in held-out runs",
     "labels": "what chosen questions and self-training gain, from few labels",
     "trials": "hide effects in simulated runs, diagnose them blindly, count what is right",
     "ablation": "what each signal set is worth to the classifier, on all labelled sets",
