@@ -87,7 +87,7 @@ REFUSED = {
         ("window length_s is 0.0; it must be positive and finite", "--window 0"),
         ("no signal set is named", "--signals ,"),
         ("unknown signal set 'sonar'; there are imu, wheels", "--signals imu,sonar"),
-        ("--protocol is 'lucky': input should be 'grouped', 'leave-one-run-out', ", "--protocol lucky"),
+        ("--protocol is 'lucky': input should be 'grouped', 'grouped-by-run', ", "--protocol lucky"),
         ("--repeats is 0: input should be greater than or equal to 1", "--repeats 0"),
         ("'fast-slow' has a single fold assignment", "--protocol fast-slow --repeats 3"),
         ("--model and --recipe do not go together", "--recipe svm --model models:/field/1"),
