@@ -203,6 +203,7 @@ def report(result: ModelResult) -> Report:
             ("robots", ", ".join(result.robots) or NOT_KNOWN),
             *((stream, ", ".join(channels)) for stream, channels in result.channels.items()),
             ("estimates of the filter", result.filter or "none"),
+            ("code of your own", ", ".join(result.own_code) or "none"),
             ("also answers", also or "nothing beside the terrain"),
         ],
         "What it needs and gives",

@@ -156,6 +156,12 @@ def evaluate_recipe(
         found |= _extras(recipe, features, samples, held_out, settings, progress)
     elif beside:
         notes.append(NO_EXTRAS)
+    if (settings.extras or channels) and windows.values:
+        plain = recipe_of(settings.with_(feature=()), BASELINE)
+        rows = Examples(feature_matrix(plain, windows), samples.terrain, samples.group)
+        first = [fold for fold in folds if fold.repeat == 0]
+        beaten = evaluate(plain[-1], rows, first, settings.jobs, BASELINE, progress)
+        found["plain_accuracy"] = beaten.accuracies[0]
     if protocol == "leave-terrain-out":
         _, checked = _of_svm(recipe, features, samples, settings)
         terrain, group, gap = samples.terrain, samples.group, samples.gap
@@ -295,11 +301,9 @@ def _extras(
     windows, terrain, seed = samples.windows, samples.terrain, settings.seed
     first = [result.fold for result in held_out.results if result.fold.repeat == 0]
 
-    def accuracies(
-        features: Array, folds: Sequence[Fold], task: str, fitted: Any = classifier
-    ) -> list[float]:
+    def accuracies(features: Array, folds: Sequence[Fold], task: str) -> list[float]:
         examples = Examples(features, terrain, samples.group)
-        return evaluate(fitted, examples, folds, settings.jobs, task, progress).accuracies
+        return evaluate(classifier, examples, folds, settings.jobs, task, progress).accuracies
 
     own = classifier is recipe[-1]
     full = held_out.accuracies[0] if own else accuracies(features, first, CHECKED_WITH)[0]
@@ -307,8 +311,6 @@ def _extras(
     if wheel_stream(windows.channels) is not None:
         wheels = FeatureExtractor(("wheels",), ("wheels",)).fit_transform(windows)
         speed_only = accuracies(wheels, first, "speed only")[0]
-    plain = recipe_of(settings.with_(feature=()), BASELINE)
-    plain_accuracy = accuracies(feature_matrix(plain, windows), first, BASELINE, plain[-1])[0]
     side, slow_fast = slow_and_fast(samples)
     if slow_fast.status is Applicability.APPLICABLE:
         slow, fast = np.flatnonzero(side == "slow"), np.flatnonzero(side == "fast")
@@ -321,7 +323,6 @@ def _extras(
     spliced = sequence_figures([track for track in tracks if track.spliced], seed)
     found = {
         "speed_only_accuracy": speed_only,
-        "plain_accuracy": plain_accuracy,
         "slow_fast": slow_fast,
         "learning_curve": learning_curve(runs_per_class, curve, full, unit),
         "courses": spliced,

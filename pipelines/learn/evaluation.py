@@ -180,9 +180,11 @@ def report(result: CrossvalResult) -> Report:
     """Return the report: the accuracy on held-out runs, each terrain, what to do next, and the rest folded."""
     dataset, curve, drives = result.dataset or "windows", result.learning_curve, result.next_drives
     decide: list[tuple[Any, ...]] = [("always the most frequent terrain", result.chance, PERCENT)]
+    if result.plain_accuracy is not None:
+        decide += result.pairs("plain_accuracy")
     if curve is not None:
         decide += [
-            *result.pairs("speed_only_accuracy", "plain_accuracy"),
+            *result.pairs("speed_only_accuracy"),
             (f"number of {result.unit}s", curve.statement),
         ]
     if result.over_time is not None:
@@ -355,7 +357,7 @@ def _checks(result: CrossvalResult) -> list[Part]:
     assert curve is not None
     out = [f"{name} left out ({reason})" for name, reason in found.left_out.items()]
     rows = [
-        *result.pairs("speed_only_accuracy", "plain_accuracy"),
+        *result.pairs("speed_only_accuracy"),
         ("trained on slow runs, tested on fast ones", found.slow_to_fast, PERCENT),
         ("the reverse", found.fast_to_slow, PERCENT),
         ("slow and fast runs", "; ".join([str(found.status), *out])),

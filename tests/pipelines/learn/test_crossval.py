@@ -146,6 +146,14 @@ def test_speed_alone_is_right_just_where_terrains_were_driven_at_speeds_of_their
     assert with_extras[1].speed_only_accuracy < 0.55  # all terrains at the same speeds
 
 
+def test_the_baseline_beside_a_recipe_is_what_it_is_alone_on_the_same_folds(with_extras, settings, tracked):
+    runs, found = with_extras
+    alone = crossval(runs, settings(recipe=("plain",), extras=False, repeats=1))
+    assert found.plain_accuracy == alone.accuracy
+    assert any("recipe plain" in str(name) for name, *_ in found.report.parts[1].rows)
+    assert 0.0 < tracked[1].crossval.plain_accuracy < 1.0  # of a training, too
+
+
 def test_extras_do_without_what_the_data_lack(drive, settings):
     """No wheels, and one run a class: no speed to learn from, and no learning curve to draw."""
     runs = []

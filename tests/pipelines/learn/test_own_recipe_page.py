@@ -63,7 +63,9 @@ def test_the_page_runs_as_it_stands(terrain, place, drive_all, monkeypatch):
         for each in predicted["windows"]
     ]
     trust_file().unlink()
+    assert terrain("inspect", "field")[0] == 2
     do(commands[4])
+    assert "field_code.roughness" in terrain("inspect", "of_another_machine", "--details")[1]
     assert (
         terrain("predict", "--data", "runs", "--model", "of_another_machine")[0] == 0
     )  # trusted once, and for all
