@@ -123,8 +123,9 @@ def ablate(name: str, settings: Settings, progress: Progress) -> tuple[str, list
         for signals, other in {**others, BASELINE: plain}.items():
             found = compare_outcomes(whole, other, np.random.default_rng(settings.seed)).accuracy
             rows.append(Worth(name, recipe, signals, found))
-    n, kind = len(np.unique(unit)), "sessions" if (unit != samples.run_id).any() else "runs"
-    return f"{len(windows)} windows of {n} {kind}", rows
+    with_session = unit != samples.run_id
+    kind = "runs" if not with_session.any() else "sessions" if with_session.all() else "sessions or runs"
+    return f"{len(windows)} windows of {len(np.unique(unit))} {kind}", rows
 
 
 def run(settings: Settings, progress: Progress = silent) -> Ablation:

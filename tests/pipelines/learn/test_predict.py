@@ -218,3 +218,20 @@ def test_a_model_of_windows_at_a_lower_rate_takes_logs_from_there_on(runs, drive
         DataError, match="runs at 50 Hz; the model, of windows at 80 Hz, needs at least 80 Hz"
     ):
         fitted_model(few, RecipeSettings(rate=("imu=80",)))
+
+
+def test_a_model_of_slip_that_was_measured_from_outside_refuses_logs_without_it(runs, drive):
+    def measured(run):
+        time_s = run.streams["wheels"].time_s
+        found = with_stream(
+            run, "slip", time_s, np.full((time_s.size, 2), 0.1), ("slip_left_ratio", "slip_right_ratio")
+        )
+        return replace(found, filter="pose")
+
+    model = fitted_model([measured(run) for run in runs if run.run_id[-1] in "12"])
+    log = drive("r", "GRASS", 4)
+    assert predict([measured(log)], model, TABLE).n_windows == 12
+    with pytest.raises(
+        DataError, match="trained on estimates of the filter 'pose', which robot husky does not run"
+    ):
+        predict([log], model, TABLE)
