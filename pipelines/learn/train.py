@@ -253,18 +253,20 @@ def _check_storable(data: TrainingData) -> None:
     from sklearn.base import clone
 
     from pipelines.learn.model_file import packed
+    from pipelines.learn.trust import remember
     from terrain.classify.grouped import OwnClassifier
     from terrain.classify.network import GroupedNetwork, require_onnx
     from terrain.classify.stack import GroupedStack
 
-    packed(list(getattr(data.recipe[0], "functions", ())))
+    _, needed = packed(list(getattr(data.recipe[0], "functions", ())))
     own = data.recipe[-1]
     if isinstance(own, GroupedNetwork) or (isinstance(own, GroupedStack) and not own.choose):
         require_onnx()
     if isinstance(own, OwnClassifier):
         terrain = data.samples.terrain
         rows = np.concatenate([np.flatnonzero(terrain == name)[:20] for name in np.unique(terrain)])
-        packed(clone(own.estimator).fit(np.nan_to_num(data.rows[rows]), terrain[rows]))
+        needed += packed(clone(own.estimator).fit(np.nan_to_num(data.rows[rows]), terrain[rows]))[1]
+    remember(needed)
 
 
 def report(result: TrainResult) -> Report:

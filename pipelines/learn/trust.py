@@ -17,7 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from terrain.errors import ConfigError, ModelError
-from terrain.files.atomic import atomic_write
+from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.files.documents import read_json
 from terrain.files.names import MAX_NAME, printable
 
@@ -45,8 +45,8 @@ def remember(names: Iterable[str]) -> None:
 
     Raises
     ------
-    ConfigError
-        if there is no such module, or it is never trusted.
+    TerrainError
+        if there is no such module, it is never trusted, or the folder cannot be written.
     """
     found = {}
     for module in sorted({name.partition(".")[0] for name in names}):
@@ -57,6 +57,7 @@ def remember(names: Iterable[str]) -> None:
         found[module] = place
     known = _remembered()
     if found.items() - known.items():
+        ensure_writable(trust_file().parent)
         trust_file().parent.mkdir(parents=True, exist_ok=True)
         atomic_write(trust_file(), json.dumps(known | found, indent=1) + "\n")
 
@@ -66,7 +67,10 @@ def check_trusted(names: Iterable[str], trusted: Iterable[str] = ()) -> None:
     allowed, known = {each.partition(".")[0] for each in trusted}, _remembered()
     for name in names:
         module = name.partition(".")[0]
-        if module in NEVER or not (module in allowed or known.get(module, "") == place_of(module) != ""):
+        there = module in known and known[module] == place_of(
+            module
+        )  # of others the current folder is not searched
+        if module in NEVER or not (module in allowed or there):
             module, name = printable(module[:MAX_NAME]), printable(name[:MAX_NAME])
             raise ModelError(
                 f"it needs code of its own, {name}, which is run only where you trust it: --trust {module}, once, or "

@@ -11,7 +11,7 @@ from pipelines.learn.classifier import TerrainClassifier
 from pipelines.learn.model_file import read_files, read_model, seal
 from pipelines.learn.recipes import load_named
 from pipelines.learn.trust import remember, trust_file
-from terrain.errors import ConfigError, ModelError
+from terrain.errors import ConfigError, ModelError, TerrainError
 
 FIELD = """
 from os import system
@@ -70,8 +70,10 @@ def test_nothing_is_imported_until_the_module_is_trusted_and_then_all_is_the_sam
     names = ("field_code.Nearest", "field_code.Peak", "field_code.roughness")
     assert read_files(folder)[0].own_code == names
     mark = field()
+    sys.path.remove(str(folder.parent))
     with pytest.raises(ModelError) as refusal:
         TerrainClassifier.load(folder)
+    assert str(folder.parent) not in sys.path  # nor is anything else of the folder found
     assert str(refusal.value) == (
         f"{folder}: it needs code of its own, field_code.Nearest, which is run only where you trust it: "
         "--trust field_code, once, or trust=('field_code',) in Python"
@@ -135,6 +137,10 @@ def test_what_cannot_be_trusted_is_one_sentence():
         with pytest.raises(ConfigError, match=sentence):
             remember(names)
     assert not trust_file().exists()
+    trust_file().parent.parent.write_text("a file where the folder would be")
+    with pytest.raises(TerrainError, match="cannot be written"):
+        remember(["field_code"])
+    trust_file().parent.parent.unlink()
     trust_file().parent.mkdir(parents=True)
     trust_file().write_text("[3]")
     with pytest.raises(ConfigError, match="is no table of modules and their files"):
