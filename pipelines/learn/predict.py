@@ -313,6 +313,7 @@ def _filtered(parts: Sequence[Windows], assessed: Sequence[Assessed], info: Mode
     """Return the column of the class that is reported over time in each window of runs; -1 for unknown."""
     import numpy as np
 
+    from pipelines.live.model import as_evidence
     from pipelines.live.windows import filter_of
     from terrain.classify.terrain_filter import filter_sessions, novelty_evidence, reported
 
@@ -322,7 +323,7 @@ def _filtered(parts: Sequence[Windows], assessed: Sequence[Assessed], info: Mode
     probability, end_s, groups, evidence = (
         np.concatenate(of_parts)
         for of_parts in (
-            [each.probability for each in assessed],
+            [as_evidence(each.probability, each.reason) for each in assessed],
             [part.start_s + part.length_s for part in parts],
             [part.groups for part in parts],
             [novelty_evidence(each.novelty, each.unknown) for each in assessed],

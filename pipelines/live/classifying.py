@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from features.stream import WindowFeed
-from pipelines.live.model import Recent, SessionStart, TerrainModel, assess
+from pipelines.live.model import Recent, SessionStart, TerrainModel, as_evidence, assess
 from pipelines.live.windows import feed_of
 from terrain.classify.answers import MANOEUVRE_S
 from terrain.classify.terrain_filter import LiveTerrainFilter
@@ -274,9 +274,8 @@ class Classifier(TerrainSource):
                 unknown = (
                     not output.refused and not output.terrain
                 )  # the window is like none that was learned
-                best, probability = self._over_time.take(
-                    output.end_s, np.array(probabilities), output.novelty, unknown
-                )
+                (evidence,) = as_evidence(np.array([probabilities]), np.array([output.reason], dtype=object))
+                best, probability = self._over_time.take(output.end_s, evidence, output.novelty, unknown)
                 terrain = classes[best] if best >= 0 else UNKNOWN
             elif output.refused:
                 continue

@@ -219,8 +219,20 @@ class Recent(NamedTuple):
     end_s: Array
 
 
+#: How much less likely a learned terrain is than another where the laws raise the alarm: they do so in 0.05 of the
+#: windows of a Warthog on learned terrains, and in 0.7 where its yaw rate is halved.
+ANSWERS_OTHERWISE = 0.05 / 0.7
 NOT_LIKE = "no learned terrain looks like this"
 NOT_CERTAIN = f"as the session is adapted to, no terrain has a probability of {CERTAIN:g}"
+
+
+def as_evidence(probability: Array, reason: Array) -> Array:
+    """Return probabilities (n, k) for a filter over time: of learned terrains less, where the laws of response say so.
+
+    The state "unknown" gains as much; what the looks say of it goes through the filter's own weight of novelty.
+    """
+    by_laws = [each not in ("", NOT_LIKE, NOT_CERTAIN) for each in reason]
+    return np.where(np.array(by_laws)[:, None], ANSWERS_OTHERWISE, 1.0) * probability
 
 
 def assess(model: TerrainModel, windows: Windows, recent: Recent | None = None) -> Assessed:

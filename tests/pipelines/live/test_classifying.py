@@ -12,8 +12,8 @@ import pytest
 
 from features.windows import cut_windows
 from pipelines.live.classifying import AT_MOST, MAX_WAITING, Classifier, WindowOutput, classify_window
-from pipelines.live.model import assess
-from terrain.classify.terrain_filter import check_settings
+from pipelines.live.model import NOT_LIKE, as_evidence, assess
+from terrain.classify.terrain_filter import check_settings, filter_run, reported
 from terrain.estimation.live import LiveFilter
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.replay import replay
@@ -83,6 +83,13 @@ def test_windows_one_by_one_are_assessed_as_those_of_a_log_and_say_why_they_are_
     assert batch.unknown.all()
     assert "does not turn like this" in batch.reason[-1]
     assert assess(model, run[-1]).answers[0] != batch.answers[-1]
+    # the filter over time follows within three windows, though the classifier is certain; looks have their own weight
+    certain, time_s = np.tile([0.9, 0.05, 0.05], (6, 1)), np.arange(2.0, 14.0, 2.0)
+    reason = np.array(["", "", NOT_LIKE, *["ASPHALT does not turn like this"] * 3], dtype=object)
+    evidence = as_evidence(certain, reason)
+    np.testing.assert_array_equal(evidence[:3], certain[:3])
+    found = reported(filter_run(evidence, time_s, check_settings([1 / 3] * 3)))
+    assert found.tolist()[:4] + found.tolist()[-1:] == [0, 0, 0, 0, -1]
 
 
 # The thread that cuts and classifies
