@@ -4,8 +4,6 @@ Run by ``pytest tests/benchmarks --benchmark-enable``.  Calls of one group do th
 times can be divided; all of it runs on one core.
 """
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import tsfel
@@ -14,12 +12,14 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
+from features.answers import answers_of
 from features.extractor import FeatureExtractor
 from features.motion import window_motion
 from features.recipes import make_recipe
 from features.windows import cut_windows
 from pipelines.data.datasets import load_runs
-from pipelines.live.model import assess
+from pipelines.live.model import TerrainModel, assess
+from terrain.classify.answers import learn_answers
 from terrain.classify.limits import learn_novelty, learn_support
 
 N_COMPARED = 8  #: tsfel takes about a tenth of a second a window
@@ -113,6 +113,7 @@ def champion(windows):
     features, motion = recipe[0].features_of(windows), window_motion(windows)
     moved = motion.speed_mps, motion.yaw_rate_radps
     support = learn_support(*moved, terrain, windows.run_id.astype(str), np.unique(terrain).tolist())
-    return SimpleNamespace(
-        recipe=recipe, novelty=learn_novelty(features, terrain, windows.run_id), support=support
-    )
+    novelty = learn_novelty(features, terrain, windows.run_id)
+    end_s = windows.start_s + windows.length_s
+    answers = learn_answers(answers_of(windows), terrain, windows.run_id, end_s)
+    return TerrainModel(recipe, None, novelty, support, answers=answers)

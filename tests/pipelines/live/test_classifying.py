@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 
 from features.windows import cut_windows
+from pipelines.data.datasets import load_runs
+from pipelines.learn.settings import RecipeSettings
+from pipelines.learn.training_data import data_of_runs, info_of, with_limits
 from pipelines.live.classifying import AT_MOST, MAX_WAITING, Classifier, WindowOutput, classify_window
 from pipelines.live.model import NOT_LIKE, as_evidence, assess
 from terrain.classify.terrain_filter import check_settings, filter_run, reported
@@ -90,6 +93,25 @@ def test_windows_one_by_one_are_assessed_as_those_of_a_log_and_say_why_they_are_
     np.testing.assert_array_equal(evidence[:3], certain[:3])
     found = reported(filter_run(evidence, time_s, check_settings([1 / 3] * 3)))
     assert found.tolist()[:4] + found.tolist()[-1:] == [0, 0, 0, 0, -1]
+
+
+@pytest.mark.slow
+def test_half_the_yaw_of_a_warthog_is_found_in_a_session_that_was_held_out(datasets_dir):
+    """As ice has it, which turns the robot less than the wheels say; the looks are those of asphalt."""
+    runs = load_runs(datasets_dir / "drive_warthog_terrains", robot="warthog")
+    settings = RecipeSettings(signal_sets=("imu", "wheels"))
+    data = data_of_runs([run for run in runs if run.session != "asphalt_2"], settings)
+    data.recipe[-1].fit(data.rows, data.samples.terrain, groups=data.samples.group)
+    info = info_of(data, settings, "")
+    model, _ = with_limits(data.recipe, info, data.samples, data.features, data.motion)
+    held_out = [run for run in runs if run.session == "asphalt_2"]
+    windows = cut_windows(held_out, info.rule, layout=info.layout).windows
+    assert assess(model, windows).unknown.mean() < 0.1
+    imu = windows.values["imu"].copy()
+    imu[:, windows.channels["imu"].index("gyro_z_radps")] *= 0.5
+    found = assess(model, replace(windows, values={**windows.values, "imu": imu}))
+    assert found.unknown.mean() > 0.6
+    assert np.char.endswith(found.reason[found.unknown].astype(str), "does not turn like this").mean() > 0.9
 
 
 # The thread that cuts and classifies
