@@ -55,8 +55,8 @@ class PredictionSettings(TrustSettings):
     """From window to window in s, as the filter of a live chain has them (0.25)."""
     out: Path | None = setting(None, "File of the predictions: .parquet or .csv.")
     adapt: str = setting("")
-    """Folder of a drive of the same session, or start (the first 20 s of each session); none switches off what the
-    model does unasked."""
+    """Folder of a drive of the same session; start (the first 20 s of each session); spread (probabilities hold any
+    session); none (as trained). By default start where training shows that it helps."""
     adapt_terrain: str = setting("", "The terrain that all of that drive, or of each start, is on.")
 
 
@@ -82,7 +82,7 @@ class Settings(PredictionSettings, ChangesSettings, AlignedRunsSettings):
             )
         if self.out is not None and self.out.suffix not in ENDINGS:
             raise ConfigError(f"--out is {self.out}: a name that ends in {' or '.join(ENDINGS)} is accepted")
-        if self.adapt_terrain and self.adapt in ("", "none"):
+        if self.adapt_terrain and self.adapt in ("", "spread", "none"):
             raise ConfigError(
                 "--adapt-terrain is the terrain of what --adapt names: start, or the folder of a drive"
             )
@@ -199,7 +199,7 @@ def _predictions(settings: Settings) -> Predictions:
     runs, skipped = load(settings)
     robot = None if settings.robot is None else load_robot(settings.robot)
     model = filtered(settings.read_model(settings.model), settings.filter_stride_s)
-    if settings.adapt in ("", "start", "none"):
+    if settings.adapt in ("", "start", "spread", "none"):
         model = with_start(model, settings.adapt, settings.adapt_terrain)
     else:
         model = _adapted(model, settings, robot)

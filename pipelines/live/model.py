@@ -190,12 +190,22 @@ class SessionStart:
 
 
 def with_start(model: TerrainModel, adapt: str, terrain: str) -> TerrainModel:
-    """Return a model as sessions begin with it: adapted by their ``start``, by ``none``, or ("") where that is shown.
+    """Return a model as sessions begin with it.
 
-    Errors as :meth:`TerrainModel.at_start`.
+    Parameters
+    ----------
+    adapt : ``start``, which adapts; ``spread``, the spread of sessions throughout; ``none``; empty: ``start`` where
+        that is shown to help
+    terrain : of each start; errors as :meth:`TerrainModel.at_start`
     """
     unasked = not adapt and model.adaptation is not None and model.adaptation.shown
-    return model.at_start(terrain) if adapt == "start" or unasked else model
+    if adapt not in ("start", "spread") and not unasked:
+        return model
+    begun = model.at_start(terrain)
+    if adapt != "spread":
+        return begun
+    assert begun.adaptation is not None
+    return begun._replace(adaptation=begun.adaptation._replace(start=None))
 
 
 class Assessed(NamedTuple):

@@ -48,9 +48,9 @@ class ServedSettings(TrustSettings):
     table: Path | None = setting(None, "Table of target slips; the packaged one by default.")
     filter_stride_s: float | None = setting(None, option="--filter-stride")
     """Windows so far apart in s (0.25), filtered over time; as trained otherwise."""
-    adapt: Literal["", "start", "none"] = setting("")
-    """start: the first 20 s of each session adapt the model to it; none: never; by default where training shows that
-    it helps."""
+    adapt: Literal["", "start", "spread", "none"] = setting("")
+    """start: the first 20 s of each session adapt the model to it; spread: probabilities hold any session; none: as
+    trained; by default start where training shows that it helps."""
     adapt_terrain: str = setting("", "The terrain that each start is on, where it is known.")
     robot: str | None = setting(None)
     """Robot by name, or its YAML file: its description is used for robots of its name."""

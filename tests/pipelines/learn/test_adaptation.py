@@ -165,6 +165,9 @@ def test_what_is_shown_is_used_unless_it_is_switched_off(fitted):
     assert with_start(model, "", "").adaptation.start is None
     assert with_start(model, "start", "ICE").adaptation.start == "ICE"
     assert with_start(shown, "", "").adaptation.start == ""
+    spread = with_start(model, "spread", "").adaptation
+    assert (spread.start, spread.found) == (None, "")
+    assert np.array_equal(spread.shift.cov, model.at_start().adaptation.shift.cov)
     assert with_start(shown, "none", "").adaptation.start is None
     with pytest.raises(DataError, match="knows no levels of currents or vibration"):
         with_start(model._replace(adaptation=None), "start", "")
