@@ -11,7 +11,7 @@ mean circumferential speeds l and r of the two sides, ``m = (l + r) / 2`` and ``
   bands of fixed frequencies, so that loggers of several rates compare;
 - *current*: magnitude of all motors together, of its ripple, and of the right side over the left, of speeds and
   acceleration;
-- *slip*: mean of all wheels, as shaking.
+- *slip*: each channel's mean, of speed, of how much is turned, and of which side is the outer one.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from features.statistics import MIN_DEFINED_FRACTION
 from features.windows import rows_of_sets, wheel_stream
 from terrain.classify.answers import Observed
 from terrain.logs.schema import signal_set_of
@@ -30,7 +31,6 @@ MAX_BAND = 0.52  #: Of the rate: up to there a band may reach. A logger of 20 Hz
 SHAKEN = {"horizontal": ("accel_x", "accel_y"), "vertical": ("accel_z",), "rocking": ("gyro_x", "gyro_y")}
 #: Speed, current and squared acceleration or rate under a logarithm: what a sensor resolves.
 MIN_SPEED_MPS, MIN_CURRENT_A, MIN_POWER = 0.05, 0.1, 1e-8
-MIN_DEFINED = 0.5  #: Share of a window in which slip has to be defined
 
 
 def answers_of(windows: Windows) -> Observed | None:
@@ -62,12 +62,13 @@ def answers_of(windows: Windows) -> Observed | None:
         turning = [ones, d, m, d * np.abs(d), d * np.abs(m)]
         forward = np.where(m < 0.0, -1.0, 1.0)
         gain_mps2 = forward * (speeds.mean(axis=1) * time_s).sum(axis=1) / (time_s @ time_s)
-        turned = np.abs(d) / (np.abs(left) + np.abs(right) + MIN_SPEED_MPS)
+        both = np.abs(left) + np.abs(right) + MIN_SPEED_MPS
+        turned, outer = np.abs(d) / both, (np.abs(right) - np.abs(left)) / both
     else:
         m, d = np.abs(mean).mean(axis=1), np.ptp(np.abs(mean), axis=1)
         turning = [ones, *mean.T]
         gain_mps2 = (np.abs(speeds).mean(axis=1) * time_s).sum(axis=1) / (time_s @ time_s)
-        turned = d / (np.abs(mean).sum(axis=1) + MIN_SPEED_MPS)
+        outer = turned = d / (np.abs(mean).sum(axis=1) + MIN_SPEED_MPS)
     fastest = np.log10(np.abs(mean).max(axis=1) + MIN_SPEED_MPS)
     shaking = [ones, fastest, turned, fastest * turned]
     found: dict[str, tuple[Array, list[Array]]] = {}
@@ -105,14 +106,12 @@ def answers_of(windows: Windows) -> Observed | None:
             if sided and all(halves):
                 over = load[:, halves[1]].sum(axis=1) - load[:, halves[0]].sum(axis=1)
                 found["current, sides"] = over, [ones, d, d * forward, m]
-        slips = [i for i, of in enumerate(sets) if of == "slip"]
-        if slips:
-            slip = np.ascontiguousarray(values[:, slips].reshape(len(windows), -1))
-            known = np.isfinite(slip)
-            share = known.mean(axis=1)
-            total = np.where(known, slip, 0.0).mean(axis=1)
-            undefined = np.full(len(windows), np.nan)
-            found["slip"] = np.divide(total, share, out=undefined, where=share >= MIN_DEFINED), shaking
+        for i in [i for i, of in enumerate(sets) if of == "slip"]:
+            known = np.isfinite(values[:, i])
+            share, total = known.mean(axis=1), np.where(known, values[:, i], 0.0).mean(axis=1)
+            undefined, enough = np.full(len(windows), np.nan), share >= MIN_DEFINED_FRACTION
+            slip = np.divide(total, share, out=undefined, where=enough)
+            found[f"slip, {channels[i].split('_')[1]}"] = slip, [ones, fastest, turned, outer]
     if not found:
         return None
     driving = np.zeros((len(windows), len(found), max(len(of) for _, of in found.values())))

@@ -33,7 +33,9 @@ def test_a_mirror_turns_what_turns_and_changes_nothing_else():
     )
     odd = [name in ("turn", "current, sides") for name in one.quantities]
     assert sum(odd) == 2
-    np.testing.assert_allclose(other.response, one.response * np.where(odd, -1.0, 1.0))
+    mirrored = [one.quantities.index(name) for name in ("slip, right", "slip, left")]
+    order = [*range(len(odd) - 2), *mirrored]
+    np.testing.assert_allclose(other.response, (one.response * np.where(odd, -1.0, 1.0))[:, order])
     turn = one.quantities.index("turn")
     np.testing.assert_allclose(other.driving[:, turn], one.driving[:, turn] * [1.0, -1.0, 1.0, -1.0, -1.0])
     shake = [i for i, name in enumerate(one.quantities) if name.startswith("shake")]
@@ -70,11 +72,13 @@ def test_bands_are_of_fixed_frequencies_at_any_rate():
 
 def test_slip_that_is_hardly_defined_is_unknown_and_robots_without_sides_have_answers():
     imu, wheels, slip = drawn(2)
-    slip[0, :, 3:] = np.nan
+    slip[0, 0, 3:], slip[1, 0, 8:] = np.nan, np.nan
     observed = answers_of(windows_of(imu, wheels, slip))
-    place = observed.quantities.index("slip")
-    assert np.isnan(observed.response[:, place]).tolist() == [True, False]
-    np.testing.assert_allclose(observed.response[1, place], slip[1].mean())
+    left, right = (
+        observed.response[:, observed.quantities.index(f"slip, {side}")] for side in ("left", "right")
+    )
+    assert np.isnan(left).tolist() == [True, False]
+    np.testing.assert_allclose([left[1], *right], [slip[1, 0, :8].mean(), *slip[:, 1].mean(axis=1)])
     names = ("speed_1_mps", "speed_2_mps", "speed_3_mps", "current_1_a")
     omni = answers_of(windows_of(imu, wheels, names=names))
     assert {"turn", "current", "current, ripple"} < set(omni.quantities)
