@@ -33,6 +33,15 @@ from terrain.classify.metrics import (
 )
 
 MAX_ROWS = 10
+WITHIN_SESSIONS = (
+    "grouped-by-run",
+    "leave-one-run-out",
+    "leave-regimes-out",
+    "published",
+    "slow-fast",
+    "fast-slow",
+)
+"""Protocols that divide sessions."""
 PERCENT = ".1%"
 
 WIDE_INTERVAL = 0.2
@@ -142,10 +151,17 @@ class CrossvalResult(Result):
     @property
     def held_out(self) -> str:
         """What was held out, in words, and what that does not show."""
-        if self.unit == "session":
-            return held_out_words(self.protocol).replace("whole runs", "whole sessions")
-        within = "runs that name no session" if not self.n_sessions else "one session"
-        return f"{held_out_words(self.protocol)}, within {within}: what another day does is not shown"
+        words = held_out_words(self.protocol)
+        if self.unit == "session" and self.protocol not in WITHIN_SESSIONS:
+            return words.replace("whole runs", "whole sessions")
+        within = (
+            "sessions"
+            if self.unit == "session"
+            else "one session"
+            if self.n_sessions
+            else "runs without a session"
+        )
+        return f"{words}, within {within}: what another day does is not shown"
 
     @property
     def weaknesses(self) -> tuple[str, ...]:

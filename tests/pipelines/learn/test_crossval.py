@@ -67,7 +67,7 @@ def test_the_report_has_what_is_promised_and_is_json(report):
     assert len(lines) <= 25
     assert re.match(r"\d+\.\d.% of windows classified correctly \(", lines[0])
     assert lines[0].endswith(
-        "whole runs held out, within runs that name no session: what another day does is not shown."
+        "whole runs held out, within runs without a session: what another day does is not shown."
     )
     assert lines[-1].startswith("next: terrain train --data DIR --recipe svm")
     assert report.to_pandas().shape == (3, 5)
