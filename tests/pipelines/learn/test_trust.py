@@ -53,6 +53,7 @@ def field(tmp_path, monkeypatch):
         (tmp_path / "imported").unlink(missing_ok=True)
         return tmp_path / "imported"
 
+    forget()  # of another test
     yield forget
     forget()
 
