@@ -45,7 +45,7 @@ def test_the_page_runs_as_it_stands(terrain, place, drive_all, monkeypatch):
 
     found = do(commands[0])
     assert [each["recipe"] for each in found["contenders"]] == ["svm", "field_code:Discriminant", "plain"]
-    monkeypatch.syspath_prepend(str(place))
+    sys.path.insert(0, str(place))
     runpy.run_path("compare.py")
     assert not trust_file().exists()
     code, _, err = terrain("predict", "--data", "runs", "--model", "field")
