@@ -90,7 +90,7 @@ class TerrainClassifier(ClassifierMixin, BaseEstimator):
         windows = labelled(WindowCut(replace(windows, terrain=terrain), {})).windows
         gap = overlap_of(windows)
         recipe = self.unfitted(gap)
-        samples = Samples(windows, {}, windows.run_id, gap)
+        samples = Samples(windows, {}, windows.groups, gap)
         recipe.fit(windows, samples.terrain)
         info = model_info(
             recipe[0].layout_,

@@ -47,7 +47,8 @@ PRIOR_NOISE = 0.0025  #: Variance of the scatter within, as of five windows more
 PRIOR_UNITS = 5.0  #: The scatter of all terrains counts as that of so many sessions beside a terrain's own.
 N_WEIGHTINGS, N_STEPS = 4, 15
 MANOEUVRE_S = 6.0  #: So long a command of DRIVE lasts.
-MIN_KNOWN = 0.1  #: Of the windows: a quantity that is known in fewer has no law.
+#: Of the windows: a quantity that is known in fewer has no law, nor has one that is known in one unit only.
+MIN_KNOWN = 0.1
 MIN_LIMIT = 1.0  #: Of a quantity's limit in standard deviations
 
 #: What a terrain does not do, by the first word of the quantity.
@@ -234,12 +235,15 @@ def learn_answers(
     """
     y, groups = np.asarray(y).astype(str), np.asarray(groups, dtype=str).reshape(len(y), -1)
     classes, unit = two_classes(y), units_of(y, groups)
-    share = np.isfinite(observed.response).mean(axis=0) >= MIN_KNOWN
+    splits, known = list(inner_splits(y, groups, N_INNER_FOLDS, seed, gap)), np.isfinite(observed.response)
+    share = np.all(
+        [known.mean(axis=0) >= MIN_KNOWN, *(known[train].any(axis=0) for train, _ in splits)], axis=0
+    )
     if not share.any():
         raise DataError(f"of {', '.join(observed.quantities)} too few are known")
     observed = observed.only(tuple(np.array(observed.quantities)[share].tolist()))
     misfits = np.full((len(y), len(classes), len(observed.quantities)), np.nan)
-    for train, test in inner_splits(y, groups, N_INNER_FOLDS, seed, gap):
+    for train, test in splits:
         misfits[test] = _fit(observed.of(train), y[train], unit[train], classes).misfits(observed.of(test))
     own = misfits[np.arange(len(y)), np.searchsorted(classes, y)]
     if not np.isfinite(own).any(axis=0).all():

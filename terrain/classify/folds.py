@@ -57,9 +57,10 @@ def single_run_classes(y: Array, groups: Array) -> list[Any]:
 
 
 def has_sessions(y: Array, groups: Array) -> bool:
-    """Return whether a class has several sessions, of which one can be held out whole."""
+    """Return whether a class has several sessions, one of them named, of which one can be held out whole."""
     session, run = np.asarray(groups, dtype=str).reshape(len(groups), -1)[:, [0, -1]].T
-    return not np.array_equal(session, run) and len(single_run_classes(y, session)) < len(np.unique(y))
+    several = ~np.isin(y, single_run_classes(y, session))
+    return bool((session != run)[several].any())
 
 
 def units_of(y: Array, groups: Array) -> Array:
@@ -69,6 +70,8 @@ def units_of(y: Array, groups: Array) -> Array:
 
 def divided_units(y: Array, groups: Array, n_parts: int) -> Array:
     """Return the unit (n,) of each row, those of classes that have one only in so many parts that follow each other.
+
+    Parts are of whole runs, whatever else a run holds; only the single run of a class is cut.
 
     Examples
     --------
@@ -80,16 +83,17 @@ def divided_units(y: Array, groups: Array, n_parts: int) -> Array:
     """
     unit, run = units_of(y, groups), run_of(groups)
     divided = unit.astype(object)
+    alone = single_run_classes(y, run)
     for terrain in single_run_classes(y, unit):
+        if terrain not in alone:
+            runs = np.unique(run[y == terrain])
+            rows = np.flatnonzero(np.isin(run, runs))
+            part = np.searchsorted(runs, run[rows]) * min(n_parts, len(runs)) // len(runs) + 1
+            divided[rows] = [f"{unit[rows[0]]} part {number}" for number in part]
+    for terrain in alone:
         rows = np.flatnonzero(y == terrain)
-        runs, place = np.unique(run[rows], return_inverse=True)
-        if len(runs) > 1:
-            divided[rows] = [
-                f"{unit[rows[0]]} part {i * min(n_parts, len(runs)) // len(runs) + 1}" for i in place
-            ]
-            continue
         for number, block in enumerate(np.array_split(rows, n_parts)):
-            divided[block] = f"{runs[0]} block {number + 1}"
+            divided[block] = f"{run[rows[0]]} block {number + 1}"
     return divided.astype(str)
 
 

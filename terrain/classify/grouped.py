@@ -147,7 +147,10 @@ class OwnClassifier(GroupedClassifier):
             margins = np.concatenate([each for _, each in held_out])
             truth = y[np.concatenate([rows for rows, _ in held_out])]
             self.margin_std_ = float(margins.std()) or 1.0  # whatever the unit of margins is
-            self.calibration_ = LogisticRegression().fit(margins / self.margin_std_, truth)
+            if np.array_equal(
+                np.unique(truth), self.classes_
+            ):  # else it would give the others no probability
+                self.calibration_ = LogisticRegression().fit(margins / self.margin_std_, truth)
         self.inner_probability_ = np.full((len(y), len(self.classes_)), np.nan)
         for rows, each in held_out:
             self.inner_probability_[rows] = self._probability(each)
@@ -168,7 +171,10 @@ class OwnClassifier(GroupedClassifier):
         if self.outputs == "predict":
             return np.asarray(found[:, None] == self.classes_, dtype=float)
         values = np.asarray(found, dtype=float)
-        return values[:, None] if values.ndim == 1 else values
+        order = np.argsort(getattr(classifier, "classes_", self.classes_))  # of a user's own, any
+        if values.ndim == 1:
+            return values[:, None] if order[0] == 0 else -values[:, None]
+        return values[:, order] if values.shape[1] == len(order) else values
 
     def _probability(self, outputs: Array) -> Array:
         if self.outputs != "decision_function":

@@ -126,12 +126,13 @@ class GroupedTrees(GroupedClassifier):
     def fit(self, X: Array, y: Array, groups: Array | None = None) -> GroupedTrees:
         """Calibrate and fit; ``DataError`` where a class has too few windows to hold some of them out."""
         X, y, groups = self._training_rows(X, y, groups)
-        held_out = np.full((len(y), len(self.classes_)), np.nan)
+        held_out, learned = np.full((len(y), len(self.classes_)), np.nan), np.zeros(len(y), dtype=bool)
         for train, test in inner_splits(y, groups, self.n_inner_folds, self.seed, self.gap, lacking=True):
             fitted = self._fitted(X[train], y[train])
             held_out[test] = LEAST_LOG  # of a class that was not there
             held_out[np.ix_(test, np.isin(self.classes_, y[train]))] = self._logs(*fitted, X[test])
-        rows = np.flatnonzero(np.isfinite(held_out).all(axis=1))
+            learned[test] = np.isin(y[test], y[train])
+        rows = np.flatnonzero(learned)  # no scale makes a class probable that was not there
         if not len(rows):
             raise DataError(TOO_FEW)
         self.scale_ = fit_scale(held_out[rows], np.searchsorted(self.classes_, y[rows]))

@@ -115,6 +115,12 @@ def test_a_quantity_that_is_hardly_known_has_no_law_and_few_rows_are_refused():
         learn_answers(rare._replace(response=np.full_like(response, np.nan)), y, groups, end_s)
 
 
+def test_a_quantity_of_one_run_has_no_law_and_leaves_the_others_theirs():
+    observed, y, groups, end_s = joined([drive(name, 9, 1, 3) for name in SLOPES])
+    observed.response[groups[:, 1] != groups[0, 1], 1] = np.nan
+    assert learn_answers(observed, y, groups[:, 1], end_s).quantities == ("turn",)
+
+
 def test_novelty_shares_the_threshold_and_each_alone_raises_the_alarm():
     data = joined([drive(name, k) for k, name in enumerate(SLOPES)])
     novelty = np.random.default_rng(3).standard_normal(len(data[1]))

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from terrain.classify.folds import (
     divided_units,
     fold_numbers,
+    has_sessions,
     hold_out_runs,
     inner_splits,
     single_run_classes,
@@ -134,3 +135,22 @@ def test_inner_folds_keep_runs_whole_and_leave_out_what_shares_samples_with_a_te
     assert list(inner_splits(y[short], groups[short], 3, 0, 4, lacking=lacking)) == []
     with pytest.raises(DataError, match="too few to hold some of them out"):
         list(inner_splits(y[:61], groups[:61], 3, 0))
+
+
+def test_a_run_over_two_terrains_stays_whole_where_one_of_them_has_one_session():
+    plan = [("monday", f"m{i}", name) for i in range(5) for name in ("mud", "ice")]
+    plan += [("tuesday", f"t{i}", "mud") for i in range(5)]
+    plan += [(name, name, "grass") for name in ("tuesday", "wednesday")]
+    session, run, y = (np.repeat(names, 4) for names in zip(*plan, strict=True))
+    for train, test in split_runs(y, np.stack([session, run], axis=1), 4, np.random.default_rng(0)):
+        assert not set(run[train]) & set(run[test])
+
+
+def test_runs_without_a_session_are_no_sessions_of_their_terrain():
+    plan = [(f"i{i}", f"i{i}", "ice") for i in range(4)] + [("monday", f"m{i}", "mud") for i in range(4)]
+    session, run, y = map(np.array, zip(*plan, strict=True))
+    groups = np.stack([session, run], axis=1)
+    assert not has_sessions(y, groups)  # neither has a second one
+    assert (units_of(y, groups) == run).all()
+    groups[0, 0] = "tuesday"
+    assert has_sessions(y, groups)

@@ -104,3 +104,13 @@ def test_numbers_that_lead_out_of_the_arrays_are_refused():
             check_forest(forest._replace(**change), 6, 3)
     with pytest.raises(DataError, match="a root or a leaf that is not there"):
         check_forest(forest._replace(roots=forest.roots[:0]), 6, 3)
+
+
+def test_a_class_that_no_fold_could_learn_does_not_flatten_the_others():
+    rng = np.random.default_rng(0)
+    y, runs = np.repeat(["ice", "mud", "sand"], [100, 100, 6]), np.r_[np.arange(200) // 10, np.full(6, 99)]
+    X = rng.normal(size=(206, 3)) + 3.0 * (y == "mud")[:, None] - 4.0 * (y == "sand")[:, None]
+    trees = GroupedTrees(n_trees=50, gap=4).fit(
+        X, y, groups=runs
+    )  # the gap takes what a block of sand leaves
+    assert trees.predict_proba(X).max(axis=1).mean() > 0.95
