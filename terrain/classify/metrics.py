@@ -543,7 +543,8 @@ def compare_outcomes(a: Outcome, b: Outcome, rng: np.random.Generator) -> Compar
         other = sorted(set(pairs[0]) ^ set(pairs[1]))[0]
         raise DataError(f"{other[0]} ({other[1]}) was judged by one of the two only")
     number, terrain = {cell: i for i, cell in enumerate(cells)}, np.array([name for _, name in cells])
-    weights = Draws.of(np.arange(len(cells)), terrain, N_PAIRED_DRAWS, rng).weights
+    draws = Draws.of(np.arange(len(cells)), terrain, N_PAIRED_DRAWS, rng)
+    weights = draws.weights[:, draws.place]  # in the order of the cells
     parts = {"": np.ones(len(cells))} | {str(name): (terrain == name) * 1.0 for name in np.unique(terrain)}
     figures, rates = [], []
     for each, of_windows in zip((a, b), pairs, strict=True):

@@ -221,7 +221,7 @@ def test_signal_sets_that_hold_the_terrain_are_better_than_those_that_do_not(dri
     assert (n_all, report.kind) == (15, "recipes")
     assert set(found.by_class) == {"ASPHALT", "GRASS", "GRAVEL"}
     assert set(found.by_support) <= {level.value for level in SupportLevel}
-    n_runs = [row.n_runs for row in found.by_support.values()]
+    n_runs = [row.n_units for row in found.by_support.values()]
     assert max(n_runs) <= n_all <= sum(n_runs)
     differences = [row.difference for row in found.by_support.values()]
     assert min(differences) <= found.accuracy.difference <= max(differences)

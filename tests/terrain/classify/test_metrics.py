@@ -241,6 +241,21 @@ def test_a_difference_in_single_runs_of_classes_is_no_verdict_however_many_agree
     assert (paired.reason, paired.difference) == (found.accuracy.reason, found.accuracy.difference)
 
 
+def test_each_draw_keeps_the_number_of_units_of_a_class():
+    """Every window of a class is right and of the other wrong: any draw within classes has the same accuracy."""
+    unit = np.repeat(
+        [f"{i}" for i in range(24)], 5
+    )  # "10" sorts before "2", and runs of the two classes alternate
+    terrain = np.where(np.arange(120) // 5 % 2, "ice", "mud")
+    a, b = (
+        Outcome(unit, terrain, right[None], np.full((1, 120), 0.9))
+        for right in (terrain == "ice", terrain == "x")
+    )
+    found = compare_outcomes(a, b, np.random.default_rng(0))
+    assert found.accuracy.interval == pytest.approx((-0.5, -0.5))
+    assert found.by_class["ice"].interval == pytest.approx((-1.0, -1.0))
+
+
 def test_windows_may_differ_but_runs_may_not():
     a, b = outcomes(0.0, 1)
     half = np.arange(len(b.unit)) % 2 == 0
