@@ -52,9 +52,29 @@ def stratified_counts(stratum: Array, n_draws: int, rng: np.random.Generator) ->
     return counts
 
 
-def freedom_of(stratum: Array) -> int:
-    """Return the degrees of freedom of a figure over units of strata (units,): those that their means leave."""
-    return len(stratum) - len(np.unique(stratum))
+def shared_strata(unit: Array, terrain: Array) -> Array:
+    """Return the stratum (n,) of units (n,): their class (n,) or, where units hold several, all that these link.
+
+    What a session shares is shared by all of its classes, so that it is one unit of all of them together.
+
+    Examples
+    --------
+    >>> shared_strata(np.array(["a", "a", "b", "c"]), np.array(["ice", "mud", "mud", "sand"])).tolist()
+    ['ice, mud', 'ice, mud', 'ice, mud', 'sand']
+    """
+    names, row = np.unique(unit, return_inverse=True)
+    classes, column = np.unique(terrain.astype(str), return_inverse=True)
+    holds = np.zeros((len(names), len(classes)), dtype=bool)
+    holds[row, column] = True
+    linked = holds.T @ holds
+    for _ in classes:
+        linked = linked @ linked
+    return np.array([", ".join(classes[each]) for each in linked])[column]
+
+
+def freedom_of(unit: Array, stratum: Array) -> int:
+    """Return the degrees of freedom of a figure over units (n,) of strata (n,): those that their means leave."""
+    return len(np.unique(unit)) - len(np.unique(stratum))
 
 
 def bootstrap_rows(n: int, n_draws: int, rng: np.random.Generator) -> Array:

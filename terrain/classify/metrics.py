@@ -1,8 +1,9 @@
 """Figures of merit of held-out windows: accuracy, votes, confidence, sets of classes, terrain over time, differences.
 
 Windows of one run are not independent, nor are runs of one session: intervals are those of a bootstrap that draws whole
-units (sessions where a class has several, otherwise runs) within their classes, and computes each figure again from the
-windows of the units drawn; of few units the percentiles are those of Student's t (:mod:`terrain.bootstrap`).  Two
+units (sessions where a class has several, otherwise runs) within their classes, together those that units share, and
+computes each figure again from the windows of the units drawn; of few units the percentiles are those of Student's t
+(:mod:`terrain.bootstrap`).  Two
 classifiers are judged on the same units, and one that is hard for one is mostly hard for the other: taking the figures
 of both from the same draw leaves this common part out of the interval of their difference.
 """
@@ -20,7 +21,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
 
-from terrain.bootstrap import freedom_of, percentile_interval, stratified_counts
+from terrain.bootstrap import freedom_of, percentile_interval, shared_strata, stratified_counts
 from terrain.classify.folds import run_of, units_of
 from terrain.classify.held_out import CURVE_DRAWS, HeldOut, Scored
 from terrain.classify.limits import KNOWN_KEPT, LEVEL, SupportLevel, conformal_sets
@@ -36,20 +37,28 @@ NO_INTERVAL: Interval = (math.nan, math.nan)
 
 
 class Draws(NamedTuple):
-    """How often each unit counts: once (the first row), then as it is drawn within its class."""
+    """How often each cell, a unit's part on a class, counts: once (the first row), then as its unit is drawn."""
 
-    weights: Array  #: (1 + draws, units)
-    place: Array  #: (n,) unit of each window
-    freedom: int  #: of a figure over the units
+    weights: Array  #: (1 + draws, cells)
+    place: Array  #: (n,) cell of each window
+    unit: Array  #: unit, stratum: (cells,) number of the unit, and that within which it is drawn
+    stratum: Array
 
     @classmethod
     def of(cls, unit: Array, terrain: Array, n_draws: int, rng: np.random.Generator) -> Self:
-        """Return draws of the units (n,) of windows within their classes (n,); one of several counts for each."""
+        """Return draws of the units (n,) of windows within their classes (n,), as :func:`shared_strata` has them."""
+        _, number = np.unique(unit.astype(str), return_inverse=True)
         names = np.char.add(np.char.add(terrain.astype(str), "\n"), unit.astype(str))
         _, first, place = np.unique(names, return_index=True, return_inverse=True)
-        stratum = terrain[first]
-        weights = np.vstack([np.ones(len(first)), stratified_counts(stratum, n_draws, rng)])
-        return cls(weights, place, freedom_of(stratum))
+        of_cell, stratum = number[first], shared_strata(number[first], terrain[first])
+        once = np.unique(of_cell, return_index=True)[1]
+        weights = stratified_counts(stratum[once], n_draws, rng)[:, of_cell]
+        return cls(np.vstack([np.ones(len(first)), weights]), place, of_cell, stratum)
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom of a figure over all units."""
+        return freedom_of(self.unit, self.stratum)
 
     def interval(self, figures: Array) -> Interval:
         """Return the 95 % interval of a figure of each draw (draws,) without the first; NaN where there is none."""
@@ -59,8 +68,7 @@ class Draws(NamedTuple):
         """Return the first ratio, and the interval of the others; None where the first has no denominator."""
         if not denominator[0]:
             return None, None
-        ratio: Array = np.full(len(numerator), np.nan)
-        np.divide(numerator, denominator, out=ratio, where=denominator > 0)
+        ratio = _over(numerator, denominator)
         low, high = self.interval(ratio[1:])
         return float(ratio[0]), None if math.isnan(low) else (low, high)
 
@@ -542,9 +550,10 @@ def compare_outcomes(a: Outcome, b: Outcome, rng: np.random.Generator) -> Compar
     if cells != sorted(set(pairs[1])):
         other = sorted(set(pairs[0]) ^ set(pairs[1]))[0]
         raise DataError(f"{other[0]} ({other[1]}) was judged by one of the two only")
-    number, terrain = {cell: i for i, cell in enumerate(cells)}, np.array([name for _, name in cells])
-    draws = Draws.of(np.arange(len(cells)), terrain, N_PAIRED_DRAWS, rng)
-    weights = draws.weights[:, draws.place]  # in the order of the cells
+    number = {cell: i for i, cell in enumerate(cells)}
+    unit, terrain = np.array(cells).T
+    draws = Draws.of(unit, terrain, N_PAIRED_DRAWS, rng)
+    weights, stratum = draws.weights[:, draws.place], draws.stratum[draws.place]
     parts = {"": np.ones(len(cells))} | {str(name): (terrain == name) * 1.0 for name in np.unique(terrain)}
     figures, rates = [], []
     for each, of_windows in zip((a, b), pairs, strict=True):
@@ -552,10 +561,11 @@ def compare_outcomes(a: Outcome, b: Outcome, rng: np.random.Generator) -> Compar
         size = np.bincount(place)
         rate = np.bincount(place, weights=each.correct.mean(axis=0)) / size
         by_part = {
-            name: weights @ (kept * rate * size) / (weights @ (kept * size)) for name, kept in parts.items()
+            name: _over(weights @ (kept * rate * size), weights @ (kept * size))
+            for name, kept in parts.items()
         }
-        of_class = [(weights[:, kept > 0], rate[kept > 0]) for name, kept in parts.items() if name]
-        macro = np.mean([drawn @ one / drawn.sum(axis=1) for drawn, one in of_class], axis=0)
+        of_class = [(weights @ (kept * rate), weights @ kept) for name, kept in parts.items() if name]
+        macro = np.mean([_over(*each) for each in of_class], axis=0)
         repeats = zip(each.confidence, each.correct.astype(float), strict=True)
         areas = [confidence_auc(c, right, weights[:, place]) for c, right in repeats]
         figures.append((by_part, macro, np.mean(areas, axis=0)))
@@ -563,12 +573,12 @@ def compare_outcomes(a: Outcome, b: Outcome, rng: np.random.Generator) -> Compar
     (parts_a, macro_a, area_a), (parts_b, macro_b, area_b) = figures
     differs = np.not_equal(*rates)
     accuracy = {
-        name: _difference(parts_a[name], parts_b[name], terrain[kept > 0], differs[kept > 0])
+        name: _difference(parts_a[name], parts_b[name], unit[kept > 0], stratum[kept > 0], differs[kept > 0])
         for name, kept in parts.items()
     }
     of_all = accuracy.pop("")
-    macro = _difference(macro_a, macro_b, terrain, differs)
-    area = _difference(area_a, area_b, terrain, np.ones(len(cells), dtype=bool))
+    macro = _difference(macro_a, macro_b, unit, stratum, differs)
+    area = _difference(area_a, area_b, unit, stratum, np.ones(len(cells), dtype=bool))
     by_unit = (UnitDifference(*cell, *pair) for cell, *pair in zip(cells, *rates, strict=True))
     return Comparison(of_all, macro, area, accuracy, tuple(by_unit))
 
@@ -581,27 +591,33 @@ def paired_accuracy(
     weights = draws.weights[:, draws.place] * n_windows
     of_a, of_b = (weights @ each / weights.sum(axis=1) for each in (a, b))
     differs = np.bincount(draws.place, a != b) > 0
-    return _difference(of_a, of_b, terrain[np.unique(draws.place, return_index=True)[1]], differs)
+    return _difference(of_a, of_b, draws.unit, draws.stratum, differs)
 
 
-def _difference(of_a: Array, of_b: Array, stratum: Array, differs: Array) -> Difference:
+def _over(numerator: Array, denominator: Array) -> Array:
+    """Return a ratio (d,); NaN of a draw without any."""
+    nothing: Array = np.full(len(numerator), np.nan)
+    return np.divide(numerator, denominator, out=nothing, where=denominator > 0)
+
+
+def _difference(of_a: Array, of_b: Array, unit: Array, stratum: Array, differs: Array) -> Difference:
     """Return the difference of figures of which the first is of all units, the others of draws of them.
 
-    ``stratum`` (units,) has the class of each unit, ``differs`` (units,) whether the two differ on it.
+    ``unit`` and ``stratum`` (cells,) are as of :class:`Draws`, ``differs`` (cells,) is whether the two differ there.
     """
     apart = of_b - of_a
-    matters = stratum[np.isin(stratum, stratum[differs])] if differs.any() else stratum
-    freedom, (low, high), reason = freedom_of(matters), NO_INTERVAL, ""
+    matters = np.isin(stratum, stratum[differs]) | ~differs.any()
+    freedom, (low, high), reason = freedom_of(unit[matters], stratum[matters]), NO_INTERVAL, ""
     if freedom >= MIN_FREEDOM:
         low, high = percentile_interval(apart[1:], freedom=freedom)
     else:
         counts = ", ".join(
-            f"{name} {n}" for name, n in zip(*np.unique(matters, return_counts=True), strict=True)
+            f"{name} {len(np.unique(unit[stratum == name]))}" for name in np.unique(stratum[matters])
         )
         reason = f"too few runs or sessions where they differ ({counts})"
     verdict = Verdict.BETTER if low > 0 else Verdict.WORSE if high < 0 else Verdict.NOT_DISTINGUISHED
     ends = float(of_a[0]), float(of_b[0]), float(apart[0])
-    return Difference(*ends, (low, high), verdict, len(stratum), reason)
+    return Difference(*ends, (low, high), verdict, len(np.unique(unit)), reason)
 
 
 MEAN_SPAN_S = 10.0  #: Novelty scores are averaged over so long: a robot crosses a terrain for longer.
@@ -686,8 +702,9 @@ def _area_interval(compared: Sequence[tuple[Array, Array]], drawn: Draws) -> Int
     weights = drawn.weights[1:]
     draws = np.zeros(len(weights))
     for won, pairs in compared:
-        area = np.einsum("dr,rs,ds->d", weights, won, weights, optimize=True)
-        draws += area / np.einsum("dr,rs,ds->d", weights, pairs, weights, optimize=True)
+        draws += _over(
+            *(np.einsum("dr,rs,ds->d", weights, each, weights, optimize=True) for each in (won, pairs))
+        )
     return drawn.interval(draws / len(compared))
 
 

@@ -337,3 +337,17 @@ def test_enough_runs_of_a_known_law_and_none_of_a_curve_that_still_climbs():
     few = enough_runs(m[:3], m[:3] / 4)
     assert few == (None, "3 sizes are too few to estimate how many runs are enough")
     assert enough_runs(m, np.full(4, 0.8))[0] == 1
+
+
+def test_a_session_on_several_terrains_is_one_unit():
+    session, terrain = (
+        np.repeat(["monday", "tuesday", "wednesday"], 40),
+        np.tile(np.repeat(["ice", "mud"], 20), 3),
+    )
+    drawn = Draws.of(session, terrain, 50, np.random.default_rng(0))
+    assert drawn.freedom == 2
+    np.testing.assert_array_equal(drawn.weights[:, :3], drawn.weights[:, 3:])  # of its ice as of its mud
+    right = np.arange(120) % 5 > np.repeat([0, 1, 2], 40)
+    a, b = (Outcome(session, terrain, each[None], np.full((1, 120), 0.9)) for each in (right, ~right))
+    found = compare_outcomes(a, b, np.random.default_rng(0))
+    assert (found.accuracy.n_units, found.by_class["ice"].n_units) == (3, 3)
