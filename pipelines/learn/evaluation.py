@@ -214,10 +214,10 @@ def report(result: CrossvalResult) -> Report:
         decide.append((f"filtered through each {result.unit}", text))
     if (found := result.refusals) is not None:
         refused, ends, worst = (
-            format_value(each, PERCENT) for each in (found.refused, found.refused_ci, found.worst_run)
+            format_value(each, PERCENT) for each in (found.refused, found.refused_ci, found.worst_unit)
         )
         decide += [
-            ("refused as unknown", f"{refused} ({ends}, {result.over}), worst run {worst}"),
+            ("refused as unknown", f"{refused} ({ends}, {result.over}), worst {result.unit} {worst}"),
             ("right of those accepted", found.accuracy_accepted, PERCENT),
             ("right and accepted, of all", found.right_and_accepted, PERCENT),
         ]

@@ -154,17 +154,21 @@ def drawn_folds(y: Array, group: Array, folds: Sequence[Fold], seed: int) -> tup
         np.array([len(set(group[train][y[train] == name])) for name in np.unique(y[train])])
         for _, _, train, _ in folds
     ]
-    sizes = [size for size in CURVE_RUNS if size < max(counts.max() for counts in available)]
-    rng = np.random.default_rng((seed, len(CURVE_RUNS)))
-    drawn = []
-    for repeat, size in enumerate(np.repeat(sizes, CURVE_DRAWS).tolist()):
-        for _, fold, train, test in folds:
-            kept = np.zeros(len(train), dtype=bool)
-            for terrain in np.unique(y[train]):
-                of_class = y[train] == terrain
-                chosen = rng.permutation(np.unique(group[train][of_class]))[:size]
-                kept |= np.isin(group[train], chosen) & of_class
-            drawn.append(Fold(repeat, fold, train[kept], test))
+    most, rng = max(counts.max() for counts in available), np.random.default_rng((seed, len(CURVE_RUNS)))
+    sizes, drawn = list[int](), list[Fold]()
+    for size in (each for each in CURVE_RUNS if each < most):
+        of_size = []
+        for repeat in range(CURVE_DRAWS):
+            for _, fold, train, test in folds:
+                kept = np.zeros(len(train), dtype=bool)
+                for terrain in np.unique(y[train]):
+                    of_class = y[train] == terrain
+                    chosen = rng.permutation(np.unique(group[train][of_class]))[:size]
+                    kept |= np.isin(group[train], chosen) & of_class
+                of_size.append(Fold(CURVE_DRAWS * len(sizes) + repeat, fold, train[kept], test))
+        if all(np.unique(y[each.train], return_counts=True)[1].min() > 1 for each in of_size):
+            sizes.append(size)  # short runs may be of a single window, with which nothing can be held out
+            drawn += of_size
     means = [[np.minimum(counts, size).mean() for counts in available] for size in (*sizes, len(y))]
     return drawn, np.mean(means, axis=1)
 

@@ -384,7 +384,7 @@ def set_figures(held_out: HeldOut, windows: Windows, unit: Array, seed: int) -> 
     )
 
 
-MIN_RUN_WINDOWS = 5  #: A run of fewer windows is not the worst one: a single window would decide.
+MIN_UNIT_WINDOWS = 5  #: A run of fewer windows is not the worst one: a single window would decide.
 
 
 class RefusalFigures(NamedTuple):
@@ -395,7 +395,7 @@ class RefusalFigures(NamedTuple):
 
     refused: float  #: part of the windows that are called unknown
     refused_ci: Interval
-    worst_run: float  #: of the run with the most, among those of at least 5 windows; NaN without
+    worst_unit: float  #: of the run or session with the most, among those of at least 5 windows; NaN without
     accuracy_accepted: float  #: of the windows that are not called unknown
     accuracy_accepted_ci: Interval
     right_and_accepted: float  #: part of all windows that is answered, and right
@@ -412,10 +412,10 @@ def refusal_figures(
     --------
     >>> refused, right = np.arange(40) % 10 == 0, np.arange(40) % 5 > 0
     >>> found = refusal_figures(refused, right, np.repeat(["ice", "mud"], 20), np.repeat(list("abcd"), 10), 0)
-    >>> found.refused, round(found.accuracy_accepted, 2), found.right_and_accepted, found.worst_run
+    >>> found.refused, round(found.accuracy_accepted, 2), found.right_and_accepted, found.worst_unit
     (0.1, 0.89, 0.8, 0.1)
     """
-    unit, run, once = units_of(terrain, groups), run_of(groups), np.ones(len(terrain))
+    unit, once = units_of(terrain, groups), np.ones(len(terrain))
     draws = Draws.of(unit, terrain, N_BOOTSTRAP, np.random.default_rng(seed))
     parts = (refused * 1.0, ~refused * 1.0, correct * ~refused * 1.0, once)
     n_refused, n_accepted, n_right, n_all = (
@@ -426,8 +426,8 @@ def refusal_figures(
     for numerator, denominator in pairs:
         value, interval = draws.ratio(numerator, denominator)
         figures.append((math.nan if value is None else value, interval or NO_INTERVAL))
-    _, run_number, size = np.unique(run, return_inverse=True, return_counts=True)
-    rates = (np.bincount(run_number, refused) / size)[size >= MIN_RUN_WINDOWS]
+    _, number, size = np.unique(unit, return_inverse=True, return_counts=True)
+    rates = (np.bincount(number, refused) / size)[size >= MIN_UNIT_WINDOWS]
     worst = float(rates.max()) if len(rates) else math.nan
     of_refused, *of_right = figures
     return RefusalFigures(*of_refused, worst, *of_right[0], *of_right[1], len(np.unique(unit)))
