@@ -4,7 +4,8 @@ Sources: Efron and Tibshirani, An Introduction to the Bootstrap (1993), 13.3 (pe
 bootstrap within strata is too narrow twice: drawing n of n gives (n - 1) / n of the variance, which n - 1 draws of
 weight n / (n - 1) mend (Rao and Wu 1988, Resampling inference with complex survey data), and percentiles are those of
 a normal distribution, not Student's t, which percentiles further out mend (Hesterberg 2015,
-The American Statistician 69, 371, 4.2).
+The American Statistician 69, 371, 4.2).  No percentile reaches beyond the units themselves, and the range of three has
+the next mean in three of four cases only: of very few, the interval is Student's t of the deviation of the draws.
 """
 
 from __future__ import annotations
@@ -15,6 +16,9 @@ from scipy.special import betaincinv, ndtr, stdtrit
 from terrain.records import Array
 
 LEVEL = 0.95  #: Probability of an interval unless another is given
+#: With fewer degrees of freedom percentiles do not reach: of five units the range has 94 %, of two of each of three
+#: classes 74 %.
+MIN_PERCENTILE_FREEDOM = 6
 
 
 def bootstrap_counts(n: int, n_draws: int, seed: int) -> Array:
@@ -85,21 +89,30 @@ def bootstrap_rows(n: int, n_draws: int, rng: np.random.Generator) -> Array:
     return rng.integers(n, size=(n_draws, n))
 
 
-def percentile_interval(draws: Array, level: float = LEVEL, freedom: float = np.inf) -> tuple[float, float]:
+def percentile_interval(
+    draws: Array,
+    level: float = LEVEL,
+    freedom: float = np.inf,
+    ends: tuple[float, float] = (-np.inf, np.inf),
+) -> tuple[float, float]:
     """Return the interval of a given probability from bootstrap draws (n_draws,); NaN is skipped.
 
-    Percentiles are those at which Student's t of so many degrees of freedom has that probability; with none the
-    interval is NaN, with one it is about the range of the draws.
+    Percentiles are those at which Student's t of so many degrees of freedom has that probability; of fewer than
+    :data:`MIN_PERCENTILE_FREEDOM` it is Student's own about their mean, within the ``ends`` of what is possible, and
+    with none NaN.
 
     Examples
     --------
     >>> percentile_interval(np.arange(101.0), 0.5)
     (25.0, 75.0)
-    >>> percentile_interval(np.arange(1001.0), 0.95, freedom=4)  # doctest: +ELLIPSIS
-    (2.74..., 997.25...)
+    >>> [round(end, 2) for end in percentile_interval(np.array([0.6, 0.8]), 0.95, 2, (0.0, 1.0))]
+    [0.27, 1.0]
     """
     if not freedom > 0 or not np.isfinite(draws).any():
         return np.nan, np.nan
+    if freedom < MIN_PERCENTILE_FREEDOM:
+        middle, half = np.nanmean(draws), stdtrit(freedom, (1 + level) / 2) * np.nanstd(draws)
+        return max(float(middle - half), ends[0]), min(float(middle + half), ends[1])
     below = ndtr(-stdtrit(freedom, (1 + level) / 2)) if np.isfinite(freedom) else (1 - level) / 2
     low, high = np.nanquantile(draws, [below, 1 - below])
     return float(low), float(high)

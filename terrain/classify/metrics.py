@@ -60,16 +60,21 @@ class Draws(NamedTuple):
         """Degrees of freedom of a figure over all units."""
         return freedom_of(self.unit, self.stratum)
 
-    def interval(self, figures: Array) -> Interval:
-        """Return the 95 % interval of a figure of each draw (draws,) without the first; NaN where there is none."""
-        return percentile_interval(figures, freedom=self.freedom)
+    def interval(self, figures: Array, ends: Interval = (0.0, 1.0)) -> Interval:
+        """Return the 95 % interval of a figure of each draw (draws,) without the first; NaN where there is none.
 
-    def ratio(self, numerator: Array, denominator: Array) -> tuple[float | None, Interval | None]:
+        ``ends`` are what the figure can be.
+        """
+        return percentile_interval(figures, freedom=self.freedom, ends=ends)
+
+    def ratio(
+        self, numerator: Array, denominator: Array, ends: Interval = (0.0, 1.0)
+    ) -> tuple[float | None, Interval | None]:
         """Return the first ratio, and the interval of the others; None where the first has no denominator."""
         if not denominator[0]:
             return None, None
         ratio = _over(numerator, denominator)
-        low, high = self.interval(ratio[1:])
+        low, high = self.interval(ratio[1:], ends)
         return float(ratio[0]), None if math.isnan(low) else (low, high)
 
 
@@ -609,7 +614,7 @@ def _difference(of_a: Array, of_b: Array, unit: Array, stratum: Array, differs: 
     matters = np.isin(stratum, stratum[differs]) | ~differs.any()
     freedom, (low, high), reason = freedom_of(unit[matters], stratum[matters]), NO_INTERVAL, ""
     if freedom >= MIN_FREEDOM:
-        low, high = percentile_interval(apart[1:], freedom=freedom)
+        low, high = percentile_interval(apart[1:], freedom=freedom, ends=(-1.0, 1.0))
     else:
         counts = ", ".join(
             f"{name} {len(np.unique(unit[stratum == name]))}" for name in np.unique(stratum[matters])
@@ -822,8 +827,8 @@ def sequence_figures(tracks: Sequence[Track], seed: int) -> SequenceFigures | No
     draws = of_runs.weights[:, of_runs.place]
     drawn = dict(zip(COUNTS, (draws @ counts).T, strict=True))
 
-    def ratio(numerator: Array, below: str = "all") -> tuple[float, Interval]:
-        value, interval = of_runs.ratio(numerator, drawn[below])
+    def ratio(numerator: Array, below: str = "all", least: float = 0.0) -> tuple[float, Interval]:
+        value, interval = of_runs.ratio(numerator, drawn[below], (least, 1.0))
         return math.nan if value is None else value, interval or NO_INTERVAL
 
     changes, found = delay_s[~np.isnan(delay_s)], np.flatnonzero(np.isfinite(delay_s))
@@ -835,7 +840,9 @@ def sequence_figures(tracks: Sequence[Track], seed: int) -> SequenceFigures | No
             return math.nan, NO_INTERVAL
         at = (upto < level * upto[:, -1:]).sum(axis=1)
         drawn_s = np.where(upto[:, -1] > 0, ordered_s[np.minimum(at, len(ordered_s) - 1)], np.nan)
-        return float(np.quantile(ordered_s, level, method="inverted_cdf")), of_runs.interval(drawn_s)
+        return float(np.quantile(ordered_s, level, method="inverted_cdf")), of_runs.interval(
+            drawn_s, (0.0, math.inf)
+        )
 
     of_all = float(np.quantile(changes, 0.9, method="inverted_cdf")) if len(found) else math.inf
     known = of_all if math.isfinite(of_all) else None
@@ -844,7 +851,7 @@ def sequence_figures(tracks: Sequence[Track], seed: int) -> SequenceFigures | No
     return SequenceFigures(
         *ratio(filtered, "whole"),
         *ratio(single, "whole"),
-        *ratio(filtered - single, "whole"),
+        *ratio(filtered - single, "whole", -1.0),
         DelayFigures(*quantile(0.5), *quantile(0.9), len(changes), n_missed, known),
         ratio(drawn["flips"] * a_minute)[0],
         ratio(drawn["single_flips"] * a_minute)[0],

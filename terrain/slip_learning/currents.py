@@ -249,7 +249,7 @@ def _figures(
     if len(counts) > 1:
         rows = bootstrap_rows(len(counts), N_DRAWS, rng)
         rms = np.sqrt(squares[rows].sum(axis=1) / counts[rows].sum(axis=1))
-        interval = percentile_interval(rms, freedom=len(counts) - 1)
+        interval = percentile_interval(rms, freedom=len(counts) - 1, ends=(0.0, np.inf))
     return PredictionFigures(
         held_out=name,
         n_runs=len(np.unique(run)),

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from terrain.bootstrap import bootstrap_counts, bootstrap_rows, percentile_interval
+from terrain.bootstrap import bootstrap_counts, bootstrap_rows, percentile_interval, stratified_counts
 
 
 def test_a_sample_has_as_many_runs_as_there_are_and_draws_each_alike():
@@ -25,3 +25,13 @@ def test_the_interval_of_a_mean_is_that_of_its_standard_error():
 
 def test_a_draw_without_a_value_is_skipped():
     assert percentile_interval(np.array([np.nan, 0.0, 1.0]), 0.5) == (0.25, 0.75)
+
+
+@pytest.mark.parametrize("n_units", [(3,), (2, 2), (2, 2, 2), (4, 3), (12,)])
+def test_the_interval_of_few_units_holds_the_truth_as_often_as_it_says(n_units):
+    rng, stratum = np.random.default_rng(0), np.repeat(np.arange(len(n_units)), n_units)
+    weights, freedom = stratified_counts(stratum, 400, rng), len(stratum) - len(n_units)
+    found = (
+        percentile_interval(weights @ rng.standard_normal(len(stratum)), freedom=freedom) for _ in range(400)
+    )
+    assert 0.92 < np.mean([low <= 0.0 <= high for low, high in found]) < 0.98
