@@ -10,6 +10,7 @@ from scipy.stats import t as student
 from sklearn.linear_model import LogisticRegression
 
 from terrain.classify.adaptation import (
+    MIN_REFERENCE_S,
     START_S,
     Adaptation,
     adapt,
@@ -64,11 +65,14 @@ def judged_adaptation(
     y, groups = windows.terrain.astype(str), windows.groups
     unit, kind = units_of(y, groups), "session" if has_sessions(y, groups) else "run"
     alone = single_run_classes(y, unit)  # what is held out of these was trained on the same session
-    lasting = [
-        name
-        for name in np.unique(unit[~np.isin(y, alone)])
-        if reference_s(windows[unit == name]) >= START_S + 2.0 * windows.length_s
-    ]
+    lasting = []
+    for name in np.unique(unit[~np.isin(y, alone)]):
+        own = windows[unit == name]
+        starts = (
+            reference_s(own[start_of(own)]) >= MIN_REFERENCE_S
+        )  # not where a pause follows the first window
+        if starts and reference_s(own) >= START_S + 2.0 * windows.length_s:
+            lasting.append(name)
     if len(lasting) < MIN_UNITS:
         few = f"{len(lasting)} {kind}s outlast a start of {START_S:g} s, {MIN_UNITS} are needed"
         return learned._replace(status=f"not shown: {few}")

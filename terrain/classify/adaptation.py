@@ -52,6 +52,7 @@ then wrong and not unknown (14 to 17 % as trained), at 0.6 it is 8 to 11 %."""
 
 WIDTHS = (0.1, 0.2, 0.4)  #: Of "driven nearly alike", among which held-out runs choose.
 MAX_ROWS = 400  #: Training windows of a ground and session that are kept, thinned evenly.
+AT_ONCE_VALUES = 8_000_000  #: Of differences between windows and kept ones: 64 MB.
 MIN_GAIN = 0.2
 _OF_EACH = ("start_s", "run_id", "terrain", "session")
 TIME_TOLERANCE_S = 1e-6
@@ -394,6 +395,7 @@ def _scatter(
     for name in np.unique(terrain):
         for each in np.unique(session[terrain == name]):
             rows = np.flatnonzero((terrain == name) & (session == each))
+            rows = rows[:: -(-len(rows) // MAX_ROWS)]  # of all sessions together there are more
             runs = run[rows]
             if len(np.unique(runs)) < 2:
                 continue
@@ -410,6 +412,10 @@ def _scatter(
 
 def _law(motion: Array, known: Array, level: Array, width: float, runs: Array | None = None) -> Array:
     """Return the mean level (n, m) of windows (p, m) driven nearly alike; of other runs, where those are given."""
+    at_once = max(AT_ONCE_VALUES // max(known.size, 1), 1)
+    if len(motion) > at_once and runs is None:
+        parts = range(0, len(motion), at_once)
+        return np.concatenate([_law(motion[i : i + at_once], known, level, width) for i in parts])
     squared = np.square(motion[:, None] - known[None]).sum(axis=2) / width**2
     if runs is not None:
         squared[runs[:, None] == runs] = np.inf

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from terrain.classify import adaptation
 from terrain.classify.adaptation import (
     COMMON,
     GAIN_STD,
@@ -180,3 +181,17 @@ def test_what_a_file_holds_is_checked(learned):
     ):
         with pytest.raises(DataError):
             check_adaptation(spoilt, classes)
+
+
+def test_many_windows_are_compared_in_blocks_and_sessions_of_one_run_by_a_part_of_them(learned, monkeypatch):
+    drive = drives(["mud"], 7, 1, gain=1.2)
+    whole = adapt(learned, drive, "mud").shift
+    monkeypatch.setattr(adaptation, "AT_ONCE_VALUES", 3 * learned.motion.size)
+    blocks = adapt(learned, drive, "mud").shift
+    np.testing.assert_allclose(blocks.mean, whole.mean, rtol=1e-9)
+    windows, sizes, law = drives(["mud", "ice"]), [], adaptation._law
+    monkeypatch.setattr(adaptation, "MAX_ROWS", 30)
+    monkeypatch.setattr(adaptation, "_law", lambda *args: sizes.append(len(args[0])) or law(*args))
+    of_runs = learn_adaptation(replace(windows, session=windows.run_id), LEVELLED, SPEEDS)
+    assert max(sizes) <= 30
+    np.testing.assert_allclose(of_runs.run_std, learned.run_std, rtol=0.5)
