@@ -29,9 +29,8 @@ def runs_dir(tmp_path, make_run):
     """Eight runs of two terrains, in run folders."""
     for name in ("ICE", "SNOW"):
         for k in range(4):
-            write_run(
-                make_run(f"{name}_{k}", name, k + 10 * (name == "ICE"), duration_s=7.0 + k), tmp_path / "runs"
-            )
+            run = make_run(f"{name}_{k}", name, k + 10 * (name == "ICE"), duration_s=7.0 + k)
+            write_run(replace(run, session=f"session {k % 2}"), tmp_path / "runs")
     return tmp_path / "runs"
 
 
@@ -61,7 +60,7 @@ def test_cached_features_are_those_of_the_runs_bit_for_bit(runs_dir, cached):
         found, _, n = cached()
         assert n == n_computed
         assert found.features.tobytes() == features.tobytes()
-        for name in ("start_s", "run_id", "terrain"):
+        for name in ("start_s", "run_id", "terrain", "session"):
             assert getattr(found.samples.windows, name).tolist() == getattr(samples.windows, name).tolist()
         for there, here in zip(found.motion, motion, strict=True):
             assert there.tobytes() == here.tobytes()

@@ -195,3 +195,13 @@ def test_many_windows_are_compared_in_blocks_and_sessions_of_one_run_by_a_part_o
     of_runs = learn_adaptation(replace(windows, session=windows.run_id), LEVELLED, SPEEDS)
     assert max(sizes) <= 30
     np.testing.assert_allclose(of_runs.run_std, learned.run_std, rtol=0.5)
+
+
+def test_a_run_is_known_better_by_more_windows_and_two_runs_better_than_by_one(learned):
+    short, long, two = (
+        adapt(learned, drives(["mud"], 7, n_runs, n), "mud").shift.cov
+        for n_runs, n in ((1, 3), (1, 40), (2, 3))
+    )
+    c = learned.classes.index("mud")
+    sizes = [np.sqrt(each[c][2, 2]) for each in (short, long, two)]
+    assert sizes[0] > 1.02 * sizes[1] > sizes[2]

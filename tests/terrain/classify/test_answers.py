@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from terrain.classify import answers
 from terrain.classify.answers import (
     Observed,
     best_misfit,
@@ -147,3 +148,13 @@ def test_numbers_that_do_not_fit_are_refused(laws):
     ):
         with pytest.raises(DataError, match="other terrains, or of what"):
             check_answers(laws, classes, shown)
+
+
+def test_the_threshold_is_over_sessions(monkeypatch):
+    observed, y, groups, end_s = joined([drive(name, k) for k, name in enumerate(SLOPES)])
+    units, threshold = [], answers.conformal_threshold
+    monkeypatch.setattr(
+        answers, "conformal_threshold", lambda s, unit, *a: units.append(unit) or threshold(s, unit, *a)
+    )
+    learn_answers(observed, y, groups, end_s)
+    assert set(units[0]) == set(groups[:, 0])

@@ -4,7 +4,18 @@ import numpy as np
 import pytest
 
 from terrain.classify.folds import Fold, split_runs
-from terrain.classify.held_out import CURVE_DRAWS, Applicability, drawn_folds, left_out_folds, slow_fast_split
+from terrain.classify.held_out import (
+    CURVE_DRAWS,
+    Applicability,
+    Examples,
+    drawn_folds,
+    fit_fold,
+    itself,
+    left_out_folds,
+    slow_fast_split,
+)
+from terrain.classify.limits import conformal_threshold, held_out_scores
+from terrain.classify.svm import GroupedSVC
 from terrain.errors import DataError
 
 
@@ -91,3 +102,14 @@ def test_a_class_with_too_little_on_a_side_is_left_out_and_named():
     side, _ = slow_fast_split(fastest, run_id, terrain, start_s, 2.0)
     assert set(side[run_id == "mixed"]) == {""}
     assert not set(run_id[side == "slow"]) & set(run_id[side == "fast"])
+
+
+def test_sets_of_a_fold_are_calibrated_over_sessions():
+    rng, session, run = np.random.default_rng(0), np.arange(240) // 20, np.arange(240) // 5
+    terrain = np.where(session % 2, "ice", "mud")
+    features = rng.normal(size=(240, 2)) + (terrain == "ice")[:, None] + rng.normal(size=(12, 2))[session]
+    examples = Examples(features, terrain, np.stack([session, 100 + run], axis=1).astype(str))
+    fold = Fold(0, 0, np.arange(240), np.zeros(0, dtype=int))
+    found = fit_fold(GroupedSVC(), examples, np.unique(terrain), fold, itself)
+    scores = held_out_scores(found.found, terrain)
+    assert found.conformal == conformal_threshold(scores, session) != conformal_threshold(scores, run)

@@ -204,3 +204,16 @@ def test_what_means_nothing_or_does_not_fit_is_refused():
         filter_run(np.ones((2, 3)), np.array([1.0, 0.0]), THREE)
     with pytest.raises(DataError, match="1 scores of novelty do not fit 2 windows"):
         filter_run(np.ones((2, 3)), np.array([0.0, 1.0]), THREE, np.zeros(1))
+
+
+def test_what_is_distinguished_is_counted_over_sessions(monkeypatch):
+    classifier, terrain, end_s, groups = held_out(0)
+    session = np.char.add("session of ", terrain)
+    session[: len(session) // 2] = np.char.add(session[: len(session) // 2], " before")
+    seen, error = [], constants._standard_error
+    monkeypatch.setattr(
+        constants, "_standard_error", lambda each, unit: seen.append(unit) or error(each, unit)
+    )
+    prior = dict(zip(classifier.classes_.tolist(), SHARES.tolist(), strict=True))
+    choose_settings(classifier, terrain, end_s, np.stack([session, groups[:, 1]], axis=1), 2.0, prior)
+    assert set(seen[0]) == set(session)

@@ -1,9 +1,12 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from terrain.classify.response import ResponseColumns
 from terrain.errors import DataError
-from terrain.slip_learning.currents import SlipRegressor
+from terrain.slip_learning import currents
+from terrain.slip_learning.currents import PredictedSlip, SlipRegressor
 
 WHEELS = np.radians([150.0, 270.0, 390.0])
 COLUMNS = ResponseColumns(3, 3)
@@ -63,3 +66,16 @@ def test_a_standing_robot_has_no_slip_and_nothing_to_learn_from_is_refused(fitte
     assert np.isnan(np.array(fitted.predict_slip(X))).all()
     with pytest.raises(DataError, match="no window has a measured slip"):
         SlipRegressor(COLUMNS).fit(np.ones((3, 6)), np.full(3, np.nan))
+
+
+def test_the_interval_of_an_error_is_over_sessions_where_there_are_several():
+    run, error = np.repeat(np.arange(30), 4), np.repeat([0.01, 0.05, 0.03], 40)
+    zero, terrain = np.zeros(120), np.full(120, "mud")
+    predicted = PredictedSlip(*np.stack([error, zero, error - 1.0, error + 1.0]))
+
+    def width(session):
+        cases = SimpleNamespace(slip=zero, run_id=run, session=session, terrain=terrain)
+        low, high = currents._figures("runs", cases, predicted, np.random.default_rng(0)).rms_interval
+        return high - low
+
+    assert width(run // 10) > 3.0 * width(np.zeros(120))
