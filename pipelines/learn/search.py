@@ -41,7 +41,7 @@ VERSION = 1
 
 
 class Trial(NamedTuple):
-    """Hyper-parameters, and the accuracy on inner folds with its 95 % interval over runs."""
+    """Hyper-parameters, and the accuracy on inner folds with its 95 % interval over sessions or runs."""
 
     params: Candidate
     accuracy: float

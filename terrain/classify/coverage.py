@@ -128,7 +128,7 @@ def held_out_support(held_out: HeldOut, run_id: Array, motion: Motion) -> tuple[
 class PartFigures(NamedTuple):
     """A part of the held-out windows: of all windows, its accuracy, and of all errors those in it.
 
-    Intervals are of 95 % over runs, None where it holds no window; the ratio of errors is None where there is none.
+    Intervals are of 95 % over units, None where it holds no window; the ratio of errors is None where there is none.
     """
 
     windows_ratio: float

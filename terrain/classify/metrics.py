@@ -193,7 +193,7 @@ class CoverageFigures(NamedTuple):
 
 
 class ReliabilityBin(NamedTuple):
-    """Mean confidence and accuracy of a bin of windows, with the 95 % interval of the accuracy over runs."""
+    """Mean confidence and accuracy of a bin of windows, with the 95 % interval of the accuracy over units."""
 
     confidence: float
     accuracy: float

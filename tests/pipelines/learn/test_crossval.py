@@ -15,17 +15,19 @@ from pipelines.data.convert import run as convert
 from pipelines.data.datasets import load_runs
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
+from pipelines.learn import evaluate as evaluation
 from pipelines.learn.comparison import compare_models
 from pipelines.learn.crossval import EvaluationSettings, crossval
 from pipelines.learn.evaluate import evaluate
 from pipelines.report.numbers import format_counts
 from pipelines.report.results import as_json
-from terrain.classify.held_out import Examples
+from terrain.classify.folds import Fold
+from terrain.classify.held_out import Examples, FoldResult, HeldOut
 from terrain.classify.limits import SupportLevel
 from terrain.classify.metrics import Verdict
 from terrain.errors import DataError
 from terrain.logs.run_folders import write_run
-from terrain.records import Label, RunLog, Stream
+from terrain.records import Label, RunLog, Stream, Windows
 
 SPEEDS = (0.3, 0.4, 0.7, 0.8)
 
@@ -306,3 +308,25 @@ def test_values_that_no_sensor_measures_and_signals_that_are_none_are_named(runs
         with pytest.raises(DataError, match=sentence) as refusal:
             crossval(data, settings())
         assert "\n" not in str(refusal.value)
+
+
+def test_the_filter_of_a_fold_is_chosen_on_the_inner_probabilities_of_its_own_terrains(monkeypatch):
+    run = np.repeat(np.arange(12), 6).astype(str).astype(object)
+    terrain = np.repeat(np.tile(["ice", "mud", "sand"], 4), 6)
+    right = 0.1 + 0.7 * (terrain[:, None] == np.unique(terrain))
+    train, test = np.arange(36), np.arange(36, 72)
+    results = [
+        FoldResult(Fold(0, i, *rows), right[rows[1]], {}, inner=right[rows[0]])
+        for i, rows in enumerate([(train, test), (test, train)])
+    ]
+    chosen, choose = [], evaluation.choose_settings
+
+    def taken(fitted, of_rows, *rest):
+        chosen.append((fitted.classes_[fitted.inner_probability_.argmax(axis=1)] == of_rows).all())
+        return choose(fitted, of_rows, *rest)
+
+    monkeypatch.setattr(evaluation, "choose_settings", taken)
+    windows = Windows({}, {}, {}, 2.0, np.tile(2.0 * np.arange(6), 12), run, terrain.astype(object))
+    found = evaluation._over_time(HeldOut.of_folds(results, terrain), windows, run, 0)
+    assert chosen == [True, True]
+    assert (found.a, found.b > 0.5) == (1.0, True)
