@@ -226,7 +226,7 @@ def report(result: CrossvalResult) -> Report:
     if drives:
         decide.append(("record next", drives[0].request))
     return Report(
-        title=f"Evaluation on held-out runs of {dataset}",
+        title=f"Evaluation on held-out {result.unit}s of {dataset}",
         answer=(
             f"{format_value(result.accuracy, PERCENT)} of windows classified correctly "
             f"({format_value(result.accuracy_ci, PERCENT)}, {result.over}), {result.held_out}."
