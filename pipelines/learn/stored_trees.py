@@ -79,16 +79,20 @@ def trees_of_arrays(fitted: Any) -> None:
     ``DataError`` says what is not as scikit-learn, or this package, had left it.
     """
     from sklearn.ensemble._gb import BaseGradientBoosting
+    from sklearn.neighbors._base import NeighborsBase
     from sklearn.svm._base import BaseLibSVM
 
-    restore = {"tree_": _restore_tree, "_predictors": _restore_boosted, "_tree": _restore_neighbours}
+    restore = {"tree_": _restore_tree, "_predictors": _restore_boosted}
     for part, name in _with_trees(fitted):
-        restore[name](part)
+        if name in restore:
+            restore[name](part)
     for part in parts_of(fitted):
         if isinstance(part, GroupedTrees) and "forest_" in vars(part):
             part.check()
         elif isinstance(part, BaseGradientBoosting) and "estimators_" in vars(part):
             _check_stages(part)
+        elif isinstance(part, NeighborsBase) and "_fit_X" in vars(part):  # followed without a tree, too
+            _restore_neighbours(part)
         elif isinstance(part, BaseLibSVM) and "support_vectors_" in vars(part):
             _check_svm(part)
 
@@ -149,6 +153,7 @@ def _restore_neighbours(part: Any) -> None:
 
     rows = part._fit_X
     _require(isinstance(rows, np.ndarray) and rows.ndim == 2 and np.isfinite(rows).all(), part, "rows")
+    _require(rows.shape[1] == part.n_features_in_, part, "rows")
     if hasattr(part, "classes_"):
         place = part._y
         _require(place.shape == (len(rows),) and place.dtype.kind == "i", part, "classes")
@@ -161,6 +166,8 @@ def _restore_neighbours(part: Any) -> None:
 def _check_svm(part: Any) -> None:
     vectors, counts, coefficients = part.support_vectors_, part._n_support, part._dual_coef_
     n_pairs, classes = 1, part._impl in ("c_svc", "nu_svc")
+    # any other is followed by the numbers of training rows
+    _require(part.kernel in ("linear", "poly", "rbf", "sigmoid"), part, "kernel and its rows")
     if classes:
         n_pairs = len(counts) * (len(counts) - 1) // 2
         _require(counts.min() >= 0 and counts.sum() == len(vectors), part, "support vectors")

@@ -103,6 +103,11 @@ def put(name, value):
     return lambda fitted: setattr(fitted, name, value(getattr(fitted, name)))
 
 
+def without_tree(neighbours):
+    del neighbours._tree  # brute force takes none
+    neighbours._y = neighbours._y + 10**9
+
+
 def swap_tree(stages):
     stages.estimators_[0, 0] = DecisionTreeClassifier().fit(X[:, :2], Y)
     stages.estimators_[0, 0].tree_ = stages.estimators_[0, 0].tree_.__reduce__()[1:]
@@ -139,6 +144,17 @@ STAGES = GradientBoostingClassifier(n_estimators=2)
             put("_y", lambda place: place + 9),
             "the classes of its KNeighborsClassifier",
         ),
+        (
+            KNeighborsClassifier(algorithm="brute", metric="manhattan"),
+            without_tree,
+            "the classes of its KNei",
+        ),
+        (
+            KNeighborsClassifier(),
+            put("_fit_X", lambda rows: rows[:, :2].copy()),
+            "the rows of its KNeighbors",
+        ),
+        (SVC(), put("kernel", lambda _: "precomputed"), "the kernel and its rows of its SVC"),
     ],
 )
 def test_numbers_of_a_stranger_are_refused_before_they_are_followed(estimator, change, sentence):
