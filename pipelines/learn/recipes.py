@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from features.recipes import WindowPipeline, make_recipe
 from pipelines.learn.settings import FEATURE_RECIPE, WITHOUT_SVM, LearnSettings
-from pipelines.learn.trust import use_current_folder
+from pipelines.learn.trust import place_of
 from terrain.classify.svm import Candidate
 from terrain.errors import ConfigError
 from terrain.files.documents import MAX_JSON_BYTES, parse_document
@@ -84,10 +84,10 @@ def load_named(text: str) -> Any:
     terrain.errors.ConfigError: math:squirt: module 'math' has no 'squirt'
     """
     module_name, _, name = text.partition(":")
-    use_current_folder()
     try:
+        place_of(module_name.partition(".")[0])
         module = importlib.import_module(module_name)
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a script ends itself
         raise ConfigError(f"{text}: module {module_name!r} cannot be imported: {error}") from error
     found = getattr(module, name, None)
     if not callable(found) and not hasattr(found, "fit"):

@@ -80,37 +80,37 @@ def check_trusted(names: Iterable[str], trusted: Iterable[str] = ()) -> None:
 
 def import_own(names: Iterable[str]) -> None:
     """Import what names mean; ``ModelError`` where one is of another module than it says, or of none of a user's."""
-    use_current_folder()
     for name in names:
         module, _, attribute = name.rpartition(".")
         top = module.partition(".")[0]
         if top in NEVER:
             raise ModelError(f"{name} is in no module of yours")
         try:
+            place_of(top)
             found = getattr(import_module(module), attribute)
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # a script ends itself
             raise ModelError(f"{name} cannot be imported: {error}") from error
         if str(getattr(found, "__module__", "")).partition(".")[0] != top:
             raise ModelError(f"{name} is none of module {top}")
 
 
 def place_of(module: str) -> str:
-    """Return the file or folder that a module would be imported from, which is not done; empty without one."""
-    use_current_folder()
+    """Return the file or folders that a module would be imported from, which is not done; empty without one.
+
+    The current folder is searched from then on only where the module is nowhere else: what an installed module imports
+    where it is there, as many do, is not to be found in a folder that somebody else has filled.
+    """
     try:
         spec = find_spec(module)
+        if spec is None and (folder := str(Path.cwd())) not in sys.path:
+            sys.path.append(folder)  # last, so that none hides a library
+            spec = find_spec(module)
     except (ImportError, ValueError):
         return ""
     if spec is None:
         return ""
     places = [spec.origin] if spec.origin else list(spec.submodule_search_locations or ())
-    return str(Path(places[0]).resolve()) if places else ""
-
-
-def use_current_folder() -> None:
-    """Let modules of the current folder be found, last, so that none hides a library."""
-    if (folder := str(Path.cwd())) not in sys.path:
-        sys.path.append(folder)
+    return os.pathsep.join(str(Path(place).resolve()) for place in places)
 
 
 def _remembered() -> dict[str, str]:

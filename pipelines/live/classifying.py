@@ -270,6 +270,8 @@ class Classifier(TerrainSource):
         for output in self.take(sample.readings, estimates):
             terrain, probability = output.terrain, output.probability
             if self._over_time is not None:
+                if self.model is not None and tuple(output.probabilities) != self.model.info.classes:
+                    continue  # of the model before, of other terrains: no evidence for the filter of this one
                 classes, probabilities = zip(*output.probabilities.items(), strict=True)
                 unknown = (
                     not output.refused and not output.terrain

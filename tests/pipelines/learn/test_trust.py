@@ -10,7 +10,7 @@ import pytest
 from pipelines.learn.classifier import TerrainClassifier
 from pipelines.learn.model_file import read_files, read_model, seal
 from pipelines.learn.recipes import load_named
-from pipelines.learn.trust import remember, trust_file
+from pipelines.learn.trust import check_trusted, remember, trust_file
 from terrain.errors import ConfigError, ModelError, TerrainError
 
 FIELD = """
@@ -103,6 +103,45 @@ def test_a_file_of_the_same_name_elsewhere_is_not_the_one_that_was_trusted(field
     with pytest.raises(ModelError, match="only where you trust it"):
         read_model(folder)
     assert not mark.exists()
+
+
+def test_an_installed_module_finds_nothing_in_the_current_folder_nor_a_folder_that_was_not_trusted(
+    field, saved, monkeypatch
+):
+    folder, _ = saved
+    mark, stranger = field(), folder.parent / "stranger"
+    for module in ("field_code", "several"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    installed = folder.parent / "installed"
+    for each in (stranger / "several", installed / "several"):
+        each.mkdir(parents=True)
+    (folder.parent / "field_code.py").rename(installed / "field_code.py")
+    with (installed / "field_code.py").open("a", encoding="utf-8") as file:
+        file.write("\ntry:\n    import faster\nexcept ImportError:\n    faster = None\n")
+    (stranger / "faster.py").write_text("from pathlib import Path\nPath('run').touch()", encoding="utf-8")
+    monkeypatch.chdir(stranger)
+    monkeypatch.setattr(
+        sys, "path", [*(each for each in sys.path if each != str(folder.parent)), str(installed)]
+    )
+    remember(["field_code", "several"])
+    read_model(folder)
+    assert (stranger / "imported").exists()
+    assert not mark.exists()
+    assert not (stranger / "run").exists()
+    check_trusted(["several.part.Thing"])
+    sys.path.append(str(stranger))  # another part of a package without a file of its own
+    with pytest.raises(ModelError, match="only where you trust it"):
+        check_trusted(["several.part.Thing"])
+
+
+def test_a_script_that_ends_itself_is_one_sentence(field, saved, tmp_path):
+    folder, _ = saved
+    field()
+    (tmp_path / "field_code.py").write_text("raise SystemExit('usage: field_code')", encoding="utf-8")
+    with pytest.raises(ModelError, match=r"field_code\.Nearest cannot be imported: usage: field_code"):
+        read_model(folder, ["field_code"])
+    with pytest.raises(ConfigError, match="'field_code' cannot be imported: usage: field_code"):
+        load_named("field_code:Nearest")
 
 
 @pytest.mark.parametrize(

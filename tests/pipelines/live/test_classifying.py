@@ -198,6 +198,18 @@ def test_the_belief_of_the_terrain_filter_goes_on_where_windows_begin_anew(gate)
     assert fresh._over_time.take(2.0, np.array([0.45, 0.55]))[0] == 1
 
 
+def test_a_window_of_a_model_of_other_terrains_is_no_evidence_after_a_swap(gate):
+    event, thread = gate
+    event.set()
+    robot, model = begun(thread), stub_model("m")
+    model.over_time, model.info.window_s, model.info.classes = check_settings((0.5, 0.5)), 2.0, ("b", "c")
+    take(robot, 0.0)
+    outputs(robot, 1)
+    robot.swap(model)
+    assert robot.update(SimpleNamespace(readings={}), []) == []
+    assert [one.nearest for one in robot.outputs] == ["m"]
+
+
 def test_of_too_many_steps_the_oldest_are_left_out_and_counted(gate):
     event, thread = gate
     robot = begun(thread)
