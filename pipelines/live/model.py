@@ -195,10 +195,13 @@ def with_start(model: TerrainModel, adapt: str, terrain: str) -> TerrainModel:
     Parameters
     ----------
     adapt : ``start``, which adapts; ``spread``, the spread of sessions throughout; ``none``; empty: ``start`` where
-        that is shown to help
+        that is shown to help, unless the model is one that was adapted and saved
     terrain : of each start; errors as :meth:`TerrainModel.at_start`
     """
-    unasked = not adapt and model.adaptation is not None and model.adaptation.shown
+    known = model.adaptation
+    if adapt == "none" and known is not None:
+        return model._replace(adaptation=known._replace(start=None, shift=None))
+    unasked = not adapt and known is not None and known.shown and known.shift is None
     if adapt not in ("start", "spread") and not unasked:
         return model
     begun = model.at_start(terrain)

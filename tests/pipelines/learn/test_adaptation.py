@@ -172,6 +172,10 @@ def test_what_is_shown_is_used_unless_it_is_switched_off(fitted):
     assert (spread.start, spread.found) == (None, "")
     assert np.array_equal(spread.shift.cov, model.at_start().adaptation.shift.cov)
     assert with_start(shown, "none", "").adaptation.start is None
+    saved = spread._replace(shift=spread.shift._replace(terrain="ICE"))  # adapted, and saved so
+    saved = model._replace(adaptation=saved._replace(shown=True))
+    assert with_start(saved, "", "") is saved
+    assert with_start(saved, "none", "").adaptation.shift is None
     with pytest.raises(DataError, match="knows no levels of currents or vibration"):
         with_start(model._replace(adaptation=None), "start", "")
 
