@@ -62,6 +62,8 @@ MAX_MODEL_BYTES = 256 * MEBIBYTE  #: Of a file as it lies on disk; those of this
 MAX_UNPACKED_BYTES = 1024 * MEBIBYTE
 """Of all that a model's archive unpacks to: megabytes of zeros pack to kilobytes."""
 
+MAX_WINDOW_VALUES = 10_000_000  #: Of a stream in a window, with which a model is tried when it is read
+
 _TRUSTED = {
     "builtins": "frozenset",
     "features.extractor": "Feature FeatureExtractor FunctionExtractor PlainExtractor SampleExtractor",
@@ -229,6 +231,8 @@ def read_model(source: str | Path, trust: Iterable[str] = ()) -> TerrainModel:
         probability = np.asarray(recipe.predict_proba(window))
         if probability.shape != (1, len(info.classes)):
             raise DataError(f"it gives probabilities of the shape {probability.shape}")
+        if not np.isfinite(probability).all():
+            raise DataError("it gives probabilities that are not finite")
         if support is not None:
             check_support(support, info.classes)
         if adaptation is not None:
@@ -313,8 +317,9 @@ def read_files(folder: Path) -> tuple[ModelInfo, dict[str, bytes]]:
             raise ModelError(f"{place}: has version {shown(version)}; version {VERSION} is read here")
         manifest = parse_document(content, Manifest)
         info, listed = manifest.info, manifest.files
-        for stream in info.layout.channels:
-            info.layout.n_samples(stream, info.rule.length_s)
+        for stream, names in info.layout.channels.items():
+            if len(names) * info.layout.n_samples(stream, info.rule.length_s) > MAX_WINDOW_VALUES:
+                raise DataError(f"a window of it has more than {MAX_WINDOW_VALUES} values of {shown(stream)}")
         if MODEL_FILE not in listed or not set(listed) <= set(FILES):
             raise DataError("its list of files is not that of a model")
     except (ConfigError, DataError, ArithmeticError, LookupError, TypeError, ValueError) as error:

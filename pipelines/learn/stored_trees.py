@@ -102,11 +102,17 @@ def _require(holds: Any, part: Any, what: str) -> None:
         raise DataError(f"the {what} of its {type(part).__name__} are not those of a fitted one")
 
 
+def _require_plain(part: Any, *arrays: Any) -> None:
+    """Refuse masked arrays: comparisons leave out what is masked, and compiled code does not."""
+    _require(all(type(each) is np.ndarray for each in arrays), part, "arrays")
+
+
 def _restore_tree(part: Any) -> None:
     from sklearn.tree._tree import NODE_DTYPE, Tree
 
     (n_features, n_classes, n_outputs), state = part.tree_
     nodes, values, n_nodes = state["nodes"], state["values"], len(state["nodes"])
+    _require_plain(part, nodes, values, n_classes)
     _require(nodes.shape == (n_nodes,) and n_nodes > 0 and nodes.dtype == NODE_DTYPE, part, "nodes")
     _require(state["node_count"] == n_nodes and n_features == part.n_features_in_, part, "numbers of nodes")
     _require(n_classes.shape == (1,) and n_classes.dtype == np.intp and n_outputs == 1, part, "outputs")
@@ -128,6 +134,7 @@ def _restore_boosted(part: Any) -> None:
     for of_round in part._predictors:
         predictors.append([TreePredictor(**arrays) for arrays in of_round])
         for nodes in (tree.nodes for tree in predictors[-1]):
+            _require_plain(part, nodes)
             _require(nodes.ndim == 1 and len(nodes) and nodes.dtype == PREDICTOR_RECORD_DTYPE, part, "nodes")
             _require(not nodes["is_categorical"].any(), part, "nodes")
             children = nodes["left"].astype(int), nodes["right"].astype(int)
@@ -152,10 +159,12 @@ def _restore_neighbours(part: Any) -> None:
     from sklearn.neighbors import BallTree, KDTree
 
     rows = part._fit_X
-    _require(isinstance(rows, np.ndarray) and rows.ndim == 2 and np.isfinite(rows).all(), part, "rows")
+    _require_plain(part, rows)
+    _require(rows.ndim == 2 and np.isfinite(rows).all(), part, "rows")
     _require(rows.shape[1] == part.n_features_in_, part, "rows")
     if hasattr(part, "classes_"):
         place = part._y
+        _require_plain(part, place)
         _require(place.shape == (len(rows),) and place.dtype.kind == "i", part, "classes")
         _require(place.min() >= 0 and place.max() < len(part.classes_), part, "classes")
     kind = {"kd_tree": KDTree, "ball_tree": BallTree}.get(part._fit_method)
@@ -165,6 +174,7 @@ def _restore_neighbours(part: Any) -> None:
 
 def _check_svm(part: Any) -> None:
     vectors, counts, coefficients = part.support_vectors_, part._n_support, part._dual_coef_
+    _require_plain(part, vectors, counts, coefficients, part.support_, part._intercept_)
     n_pairs, classes = 1, part._impl in ("c_svc", "nu_svc")
     # any other is followed by the numbers of training rows
     _require(part.kernel in ("linear", "poly", "rbf", "sigmoid"), part, "kernel and its rows")

@@ -75,7 +75,7 @@ def check_forest(forest: Forest, n_features: int, n_classes: int) -> None:
     }  # fmt: skip
     for name, shape in shapes.items():
         array, kind = getattr(forest, name), np.float64 if name in FLOATS else np.int32
-        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != kind:
+        if type(array) is not np.ndarray or array.shape != shape or array.dtype != kind:
             raise DataError(f"the {name} of its trees is no array {shape} of {kind.__name__}")
         if kind is np.float64 and np.isnan(array).any():
             raise DataError(f"the {name} of its trees is not a number")

@@ -168,6 +168,7 @@ def test_a_manifest_of_a_stranger_is_one_sentence(model_dir):
         ({"info": info | {"window_s": -2.0}}, r"is damaged \(window length_s is -2\.0"),
         ({"info": info | {"window_s": 10**400}}, "more than 64 bits"),
         ({"info": info | {"window_s": float("nan")}}, "holds NaN, finite numbers"),
+        ({"info": info | {"window_s": 1e6}}, r"is damaged \(a window of it has more than 10000000 values"),
         ({"info": info | {"steady": {"a\nb": 1}}}, "is damaged"),
         ({"info": info | {"rate_hz": dict.fromkeys(info["rate_hz"], 1e308)}}, "is damaged"),
         ({"info": info | {"channels": {"imu": ["gyro_x_radps"]}}}, "cannot be loaded"),

@@ -113,6 +113,10 @@ def swap_tree(stages):
     stages.estimators_[0, 0].tree_ = stages.estimators_[0, 0].tree_.__reduce__()[1:]
 
 
+def masked(array):
+    return np.ma.MaskedArray(array, mask=np.arange(len(array)) > 0)
+
+
 TREE, BOOSTED = DecisionTreeClassifier(), HistGradientBoostingClassifier(max_iter=2)
 STAGES = GradientBoostingClassifier(n_estimators=2)
 
@@ -154,6 +158,13 @@ STAGES = GradientBoostingClassifier(n_estimators=2)
             put("_fit_X", lambda rows: rows[:, :2].copy()),
             "the rows of its KNeighbors",
         ),
+        (
+            TREE,
+            lambda tree: set_state("nodes", masked(tree.tree_[1]["nodes"]))(tree),
+            "the arrays of its Dec",
+        ),
+        (SVC(), put("_n_support", masked), "the arrays of its SVC"),
+        (KNeighborsClassifier(), put("_y", masked), "the arrays of its KNeighborsClassifier"),
         (SVC(), put("kernel", lambda _: "precomputed"), "the kernel and its rows of its SVC"),
     ],
 )
@@ -179,6 +190,11 @@ def test_trees_as_they_are_and_forests_that_lead_back_are_refused_in_one_sentenc
         ({"forest_": forest._replace(right=back)}, "a child that is not there, or that leads back"),
         ({"forest_": DecisionTreeClassifier().fit(X, Y)}, r"holds sklearn\.tree\._tree\.Tree, a type that"),
         ({"forest_": LogisticRegression()}, "its trees are no forest of features"),
+        (
+            {"forest_": forest._replace(right=np.ma.MaskedArray(back, mask=True))},
+            "the right of its trees is no",
+        ),
+        ({"forest_": forest, "scale_": np.nan}, "gives probabilities that are not finite"),
     ):
         vars(model.recipe[-1]).update(part)
         (folder / MODEL_FILE).write_bytes(skops_io().dumps(model.recipe))
