@@ -53,6 +53,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.distance import cdist
+from scipy.special import stdtrit
 
 from terrain.classify.folds import TOO_FEW, inner_splits, two_classes, units_of
 from terrain.errors import DataError
@@ -377,6 +378,7 @@ def support_levels(n_runs: Array) -> Array:
 
 
 LEVEL = 0.9  #: Of the sets of classes.
+ONE_SIDED = 0.9  #: Of the bound of their coverage, where units are few.
 
 
 def held_out_scores(classifier: Any, terrain: Array) -> Array:
@@ -388,9 +390,9 @@ def held_out_scores(classifier: Any, terrain: Array) -> Array:
 def conformal_threshold(scores: Array, units: Array, level: float = LEVEL, most: float = 1.0) -> float:
     """Return q of held-out scores (n,), NaN left out, over their units (n,), sessions or runs.
 
-    Where the units are too few for a guarantee, q is the smallest score up to which the mean of their distributions,
-    less its standard error, reaches the level; with one unit it is the most that a score can be.  ``DataError`` where
-    no score is finite.
+    Where the units are too few for a guarantee, q is the smallest score up to which the mean of their distributions
+    reaches the level by its one-sided bound (Student's t); with one unit it is the most that a score can be.
+    ``DataError`` where no score is finite.
 
     Examples
     --------
@@ -412,7 +414,8 @@ def conformal_threshold(scores: Array, units: Array, level: float = LEVEL, most:
         held = np.cumsum(1.0 / (n_windows[unit_of[order]] * (n_units + 1.0)))
     elif n_units > 1:
         each = np.cumsum(unit_of[order, None] == np.arange(n_units), axis=0) / n_windows
-        held = each.mean(axis=1) - each.std(axis=1, ddof=1) / np.sqrt(n_units)
+        error = each.std(axis=1, ddof=1) / np.sqrt(n_units)
+        held = each.mean(axis=1) - stdtrit(n_units - 1, ONE_SIDED) * error
     else:
         return most
     reached = held >= level - 1e-12
