@@ -233,7 +233,8 @@ def _of_svm(
 def _over_time(held_out: HeldOut, windows: Windows, unit: Array, seed: int) -> Difference | None:
     """Return the accuracy of the first fold assignment by single windows, and by the filter through runs or sessions.
 
-    The settings of each fold are those that its own training part chooses; None of a classifier without inner folds.
+    The settings of each fold are those that its own training part chooses; belief goes on through the windows of its
+    sessions that other folds hold out.  None of a classifier without inner folds.
     """
     terrain, end_s, groups = held_out.truth, windows.start_s + windows.length_s, windows.groups
     right = np.zeros((2, len(terrain)), dtype=bool)
@@ -249,9 +250,11 @@ def _over_time(held_out: HeldOut, windows: Windows, unit: Array, seed: int) -> D
         settings = choose_settings(fitted, *of_training)
         right[:, test] = probability.argmax(axis=1) == np.searchsorted(held_out.classes, terrain[test])
         if settings is not None:
-            along = end_s[test], groups[test], windows.length_s, settings
-            found = reported(filter_sessions(probability[:, columns], *along))
-            right[1, test] = (found >= 0) & (classes[found] == terrain[test])
+            along = np.flatnonzero(held_out.tested & np.isin(groups[:, 0], groups[test, 0]))
+            of_sessions = end_s[along], groups[along], windows.length_s, settings
+            found = reported(filter_sessions(held_out.probability[0][np.ix_(along, columns)], *of_sessions))
+            mine = np.isin(along, test)
+            right[1, along[mine]] = (found[mine] >= 0) & (classes[found[mine]] == terrain[along[mine]])
     rows = np.flatnonzero(held_out.tested)
     if not right.any():
         return None

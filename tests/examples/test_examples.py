@@ -155,7 +155,7 @@ def test_the_tour_goes_through_the_whole_chain(tmp_path, monkeypatch, capsys):
             write_run(run, tmp_path / "logs")
     monkeypatch.chdir(tmp_path)
     found = example("tour")
-    assert "of windows classified correctly, whole runs held out" in capsys.readouterr().out
+    assert "whole runs held out, within runs without a session" in capsys.readouterr().out
     assert (tmp_path / "explained.html").read_text().count("<details>") >= 3
     assert (tmp_path / "field" / "terrain_model.json").is_file()
     assert found.live.belief is not None

@@ -24,7 +24,7 @@ from pipelines.learn.settings import LearnSettings
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import JobsSettings, setting
 from pipelines.report.tree import Column, Report, Table
-from terrain.classify.folds import Fold
+from terrain.classify.folds import Fold, run_of
 from terrain.classify.held_out import Examples
 from terrain.classify.limits import SUPPORTED, Motion, learn_support, supported_probability
 from terrain.classify.metrics import Difference, Outcome, compare_outcomes
@@ -113,7 +113,7 @@ def _fold_labels(
     rng = np.random.default_rng(seed)
     rows = fold.train
     truth = examples.terrain[rows]
-    runs = np.char.add(np.char.add(examples.group[rows].astype(str), " "), truth)
+    runs = np.char.add(np.char.add(run_of(examples.group[rows]), " "), truth)
     of_class = [np.unique(runs[truth == name]) for name in np.unique(truth)]
     if len(of_class) < len(np.unique(examples.terrain)):
         raise DataError("a terrain has no run to train on in a fold; add runs")

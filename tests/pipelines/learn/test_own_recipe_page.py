@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from joblib.externals.loky import get_reusable_executor
 
 from pipelines.data.datasets import load_runs
 from pipelines.learn.model_file import read_files, read_model
@@ -27,6 +28,7 @@ PAGE = Path(__file__).resolve().parents[3] / "docs" / "add_a_recipe.md"
 def test_the_page_runs_as_it_stands(terrain, place, drive_all, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(place / "configuration"))
     monkeypatch.setattr(sys, "path", [*sys.path])
+    get_reusable_executor().shutdown()  # processes of other tests, which know other paths
     python = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
     shell = re.findall(r"```sh\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
     estimator, feature, compare = python
