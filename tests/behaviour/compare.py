@@ -56,14 +56,18 @@ LOOSE: dict[str, dict[str, float]] = {
         "/steps/02/json": 1e-5,
     },
     "estimate_swerve": {"/steps/04/json": 2e-3},
+    "slip": {
+        "/files/table.yaml/terrains/grass/curve": 2e-3,
+        "/steps/01/json/terrains/grass/energy_jpm": 2e-3,
+    },
     "testbed": {"/steps/03/json": 2e-2},
 }
 """By case, the paths that are compared by a relative tolerance of their own.
 
 In ``estimate_swerve`` step 4 is the tuning ``likelihood``: its search stops where the likelihood is flat, so
 that rounding of 1e-13 in the measurements moves the scale of the gyro's bias by 1e-3, and figures by 1e-6.
-In ``testbed`` the fits of step 3 end where the sum of squares changes by 1e-5.  ``calibrate`` and ``observers``: fits
-and filters round otherwise on another processor."""
+In ``testbed`` the fits of step 3 end where the sum of squares changes by 1e-5.  ``calibrate``, ``observers`` and
+``slip``: fits and filters round otherwise on another processor."""
 
 _RANDOM_ID = re.compile(r"[0-9a-f]{32}|[0-9a-f]{40}|[0-9a-f]{64}")
 
