@@ -179,6 +179,7 @@ def test_runs_weigh_alike_however_long_and_one_of_them_holds_all_classes():
     assert conformal_threshold(scores, runs, 0.9) == 0.1  # one run in twenty
     assert conformal_threshold(scores, np.arange(1019), 0.9) == 0.9
     assert conformal_threshold(np.zeros(50), np.zeros(50), 0.9) == 1.0
+    assert conformal_threshold(np.arange(10) / 10, np.arange(10), 0.9) == 0.9  # the new run is one of eleven
     assert conformal_threshold(np.append(np.zeros(20), np.nan), np.arange(21), 0.9) == 0.0
     with pytest.raises(DataError, match="no held-out window"):
         conformal_threshold(np.full(3, np.nan), np.arange(3))
