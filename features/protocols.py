@@ -106,6 +106,7 @@ class Protocol(NamedTuple):
     note: str = ""  #: what a reader of the figures must know of it
     #: whether a run is on one side of a split, but for the blocks of a class with one unit
     whole_runs: bool = True
+    whole_sessions: bool = False  #: whether, where a terrain has several sessions, these are on one side, too
 
 
 def _leave_one_out(y: Array, group: Array, n_folds: int, rng: np.random.Generator) -> Array:
@@ -180,7 +181,7 @@ def _groups(samples: Samples) -> Array:
 
 #: By name.
 PROTOCOLS: dict[str, Protocol] = {
-    "grouped": Protocol("whole runs held out", _groups, fold_numbers, 5),
+    "grouped": Protocol("whole runs held out", _groups, fold_numbers, 5, whole_sessions=True),
     "grouped-by-run": Protocol(
         "whole runs held out",
         whole_runs,
@@ -189,13 +190,16 @@ PROTOCOLS: dict[str, Protocol] = {
         "runs of one session lie on both sides of the split: what another day does is not shown",
     ),
     "leave-one-run-out": Protocol("one run held out at a time", whole_runs, _leave_one_out),
-    "leave-sessions-out": Protocol("one session held out at a time", sessions, _leave_one_out),
+    "leave-sessions-out": Protocol(
+        "one session held out at a time", sessions, _leave_one_out, whole_sessions=True
+    ),
     "leave-regimes-out": Protocol("speeds and directions of driving held out", regimes, fold_numbers, 5),
     "leave-terrain-out": Protocol(
         "whole runs held out",
         _groups,
         fold_numbers,
         note="accuracy and the table of classes are of folds in which all terrains are known",
+        whole_sessions=True,
     ),
     "published": Protocol(
         "parts of the same runs held out",

@@ -209,7 +209,7 @@ def evaluation_of(held_out: HeldOut, samples: Samples, seed: int, **fields: Any)
     result = CrossvalResult(
         **held_out_figures(held_out, samples.windows, samples.unit, segment, seed),
         unit="session" if has_sessions(samples.terrain, samples.windows.groups) else "run",
-        n_sessions=len(set(map(str, np.unique(samples.windows.groups[:, 0]))) - set(samples.run_id)),
+        n_sessions=len(np.setdiff1d(samples.windows.groups[:, 0], samples.run_id)),
         window_s=samples.windows.length_s,
         seed=seed,
         dropped=dict(samples.dropped),

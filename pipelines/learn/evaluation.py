@@ -33,15 +33,6 @@ from terrain.classify.metrics import (
 )
 
 MAX_ROWS = 10
-WITHIN_SESSIONS = (
-    "grouped-by-run",
-    "leave-one-run-out",
-    "leave-regimes-out",
-    "published",
-    "slow-fast",
-    "fast-slow",
-)
-"""Protocols that divide sessions."""
 PERCENT = ".1%"
 
 WIDE_INTERVAL = 0.2
@@ -151,16 +142,13 @@ class CrossvalResult(Result):
     @property
     def held_out(self) -> str:
         """What was held out, in words, and what that does not show."""
-        words = held_out_words(self.protocol)
-        if self.unit == "session" and self.protocol not in WITHIN_SESSIONS:
+        words, protocol = held_out_words(self.protocol), PROTOCOLS.get(self.protocol)
+        if self.unit == "session" and (
+            protocol is None or protocol.whole_sessions
+        ):  # None: of a model, on other runs
             return words.replace("whole runs", "whole sessions")
-        within = (
-            "sessions"
-            if self.unit == "session"
-            else "one session"
-            if self.n_sessions
-            else "runs without a session"
-        )
+        of_runs = "one session" if self.n_sessions else "runs without a session"
+        within = "sessions" if self.unit == "session" else of_runs
         return f"{words}, within {within}: what another day does is not shown"
 
     @property
