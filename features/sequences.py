@@ -12,6 +12,7 @@ import numpy as np
 
 from features.windows import Layout, WindowRule, cut_windows, regular_starts, span_of
 from terrain.classify.folds import Fold
+from terrain.classify.held_out import inner_probability
 from terrain.classify.metrics import STRIDE_S, Track, last_class, track_of
 from terrain.classify.terrain_filter import FilterSettings, choose_settings, filter_run, reported
 from terrain.logs.splicing import order_stretches, parts_under, splice_runs, stretches_of
@@ -27,14 +28,18 @@ def follow(
     rule: WindowRule,
     layout: Layout,
     classes: Array,
-    choose: Callable[[Any], FilterSettings | None],
+    choose: Callable[[Array | None], FilterSettings | None],
     classifier: Any,
 ) -> list[Track]:
     """Return what a fitted classifier and its filter report along each sequence.
 
-    ``choose`` gives the settings of the filter from the classifier; None to take single windows.
+    ``choose`` gives the settings of the filter from what inner folds held out; None to take single windows.
     """
-    settings, tracks, rule = choose(classifier), [], replace(rule, stride_s=STRIDE_S)
+    settings, tracks, rule = (
+        choose(inner_probability(classifier, classes)),
+        [],
+        replace(rule, stride_s=STRIDE_S),
+    )
     for log, runs, spliced in sequences:
         begin_s, end_s = span_of(log, layout)
         starts_s = regular_starts(begin_s, end_s, rule.length_s, STRIDE_S)

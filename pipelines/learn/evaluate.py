@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -245,9 +244,8 @@ def _over_time(held_out: HeldOut, windows: Windows, unit: Array, seed: int) -> D
         classes, counts = np.unique(terrain[train], return_counts=True)
         columns = np.searchsorted(held_out.classes, classes)
         prior = dict(zip(classes.tolist(), (counts / counts.sum()).tolist(), strict=True))
-        fitted = SimpleNamespace(classes_=classes, inner_probability_=inner[:, columns])
         of_training = terrain[train], end_s[train], groups[train], windows.length_s, prior
-        settings = choose_settings(fitted, *of_training)
+        settings = choose_settings(inner[:, columns], *of_training)
         right[:, test] = probability.argmax(axis=1) == np.searchsorted(held_out.classes, terrain[test])
         if settings is not None:
             along = np.flatnonzero(held_out.tested & np.isin(groups[:, 0], groups[test, 0]))

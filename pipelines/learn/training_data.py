@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain.classify.answers import learn_answers
+from terrain.classify.held_out import inner_probability
 from terrain.classify.limits import (
     Motion,
     conformal_threshold,
@@ -167,15 +168,19 @@ def with_limits(
         conformal = conformal_threshold(held_out_scores(recipe[-1], terrain), samples.unit)
     except (AttributeError, DataError) as error:
         notes.append(f"no sets of terrains: {error}")
+    taken_over: tuple[TakenOver, ...] = ()
+    if (held_out := inner_probability(recipe[-1], np.array(info.classes))) is not None:
+        shares = np.array([*info.class_ratio.values()])
+        taken_over = held_out_errors(windows, held_out, info.classes, shares, samples.unit)
     over_time = choose_settings(
-        recipe[-1], terrain, end_s, windows.groups, windows.length_s, info.class_ratio, evidence
+        held_out, terrain, end_s, windows.groups, windows.length_s, info.class_ratio, evidence
     )
     if over_time is None:
         notes.append("no terrain is filtered over time: on held-out runs single windows are right more often")
     info = replace(
         info,
         conformal=conformal,
-        taken_over=_errors_taken_over(recipe[-1], info, samples),
+        taken_over=taken_over,
         share_power=None if over_time is None else over_time.share_power,
         novelty_weight=info.novelty_weight if over_time is None else over_time.novelty_weight,
     )
@@ -191,15 +196,6 @@ def with_limits(
     except DataError as error:
         notes.append(f"no adapting to a session: {error}")
     return TerrainModel(recipe, info, novelty, support, None, adaptation, answers), tuple(notes)
-
-
-def _errors_taken_over(classifier: Any, info: ModelInfo, samples: Samples) -> tuple[TakenOver, ...]:
-    """Return how wrong proposals of labels are on held-out runs; nothing of a classifier that held none out."""
-    held_out = getattr(classifier, "inner_probability_", None)
-    if held_out is None:
-        return ()
-    prior = np.array([info.class_ratio[name] for name in info.classes])
-    return held_out_errors(samples.windows, held_out, info.classes, prior, samples.unit)
 
 
 def fitted_model(

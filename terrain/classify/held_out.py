@@ -75,16 +75,23 @@ def fit_fold(
         probability[:, np.searchsorted(classes, fitted.classes_)] = fitted.predict_proba(features[test])
     best = getattr(fitted, "best_", None)
     chosen = {} if best is None else dict(best._asdict())
-    threshold, inner = math.nan, None
-    if hasattr(fitted, "inner_probability_"):
-        inner = np.zeros((len(train), len(classes)))
-        inner[:, np.searchsorted(classes, fitted.classes_)] = fitted.inner_probability_
+    threshold, inner = math.nan, inner_probability(fitted, classes)
+    if inner is not None:
         try:
             scores = held_out_scores(fitted, terrain[train])
             threshold = conformal_threshold(scores, units_of(terrain[train], group[train]))
         except DataError:
             pass
     return FoldResult(fold, probability, chosen, None if ask is None else ask(fitted), threshold, inner)
+
+
+def inner_probability(fitted: Any, classes: Array) -> Array | None:
+    """Return probabilities (n, k) of training rows while inner folds held them out; None without inner folds."""
+    if not hasattr(fitted, "inner_probability_"):
+        return None
+    probability = np.zeros((len(fitted.inner_probability_), len(classes)))
+    probability[:, np.searchsorted(classes, fitted.classes_)] = fitted.inner_probability_
+    return probability
 
 
 def itself(fitted: Any) -> Any:

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -234,7 +234,7 @@ def novelty_evidence(novelty: Array, unknown: Array) -> Array:
 
 
 def choose_settings(
-    classifier: Any,
+    held_out: Array | None,
     terrain: Array,
     end_s: Array,
     groups: Array,
@@ -250,26 +250,23 @@ def choose_settings(
 
     Parameters
     ----------
-    classifier : fitted on n windows; where it has no ``inner_probability_`` of them when their runs or sessions were
-        held out, the settings are those that are preferred
+    held_out : (n, k) probabilities of windows when their runs or sessions were held out, NaN where they were not; where
+        there are none, the settings are those that are preferred
     terrain : (n,) class of each window
     end_s, groups, length_s, novelty : as of :func:`filter_sessions`
-    prior : share of each class among the training windows, in order
+    prior : share of each of the k classes among the training windows, in order
     """
     classes, shares = np.array([*prior]), check_settings([*prior.values()]).prior
-    truth, probability = np.searchsorted(classes, terrain), np.zeros((len(terrain), len(classes)))
-    held_out = getattr(classifier, "inner_probability_", math.nan)
-    probability[:, np.searchsorted(classes, classifier.classes_)] = held_out
-    there = np.isfinite(probability).all(axis=1)
     weights = NOVELTY_WEIGHTS[:1] if novelty is None else NOVELTY_WEIGHTS
     choices = [FilterSettings(shares, power, weight) for weight in weights for power in SHARE_POWERS]
-    if not there.any():
+    if held_out is None or not (there := np.isfinite(held_out).all(axis=1)).any():
         return choices[0]
+    truth = np.searchsorted(classes, terrain)
     right = np.empty((len(choices), there.sum()))
     for i, settings in enumerate(choices):
-        belief = filter_sessions(probability, end_s, groups, length_s, settings, novelty)
+        belief = filter_sessions(held_out, end_s, groups, length_s, settings, novelty)
         right[i] = (reported(belief) == truth)[there]
-    single = np.mean(probability[there].argmax(axis=1) == truth[there])
+    single = np.mean(held_out[there].argmax(axis=1) == truth[there])
     accuracy = right.mean(axis=1)
     unit = units_of(truth, groups)[there]
     behind = right[accuracy.argmax()] - right

@@ -321,9 +321,9 @@ def test_the_filter_of_a_fold_is_chosen_on_the_inner_probabilities_of_its_own_te
     ]
     chosen, choose = [], evaluation.choose_settings
 
-    def taken(fitted, of_rows, *rest):
-        chosen.append((fitted.classes_[fitted.inner_probability_.argmax(axis=1)] == of_rows).all())
-        return choose(fitted, of_rows, *rest)
+    def taken(inner, of_rows, *rest):
+        chosen.append((np.array([*rest[-1]])[inner.argmax(axis=1)] == of_rows).all())
+        return choose(inner, of_rows, *rest)
 
     monkeypatch.setattr(evaluation, "choose_settings", taken)
     windows = Windows({}, {}, {}, 2.0, np.tile(2.0 * np.arange(6), 12), run, terrain.astype(object))

@@ -1,7 +1,5 @@
 """The filter of the terrain over time by its plain form, and what held-out windows choose for it."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -130,8 +128,12 @@ def test_a_clock_that_goes_back_costs_one_window():
     assert [live.take(2.0 + k, certain[1])[0] for k in range(4)][-1] == 1
 
 
+NAMES = np.array(["grass", "ice", "mud"])
+PRIOR = dict(zip(NAMES.tolist(), SHARES.tolist(), strict=True))
+
+
 def held_out(seed, n_runs=12, n=20, right=0.6, shares=(1.0, 1.0, 1.0)):
-    """Return a classifier, classes, ends and runs of windows of drawn posteriors, which err run by run."""
+    """Return drawn posteriors of windows, which err run by run, and the windows' classes, ends and runs."""
     rng = np.random.default_rng(seed)
     truth = np.repeat(np.arange(n_runs) % 3, n)
     run = np.repeat(np.arange(n_runs), n).astype(str)
@@ -139,18 +141,14 @@ def held_out(seed, n_runs=12, n=20, right=0.6, shares=(1.0, 1.0, 1.0)):
     log_odds[np.arange(len(truth)), truth] += 2.0 * right
     probability = np.exp(log_odds) * shares
     probability /= probability.sum(axis=1, keepdims=True)
-    names = np.array(["grass", "ice", "mud"])
-    classifier = SimpleNamespace(classes_=names, inner_probability_=probability)
-    return classifier, names[truth], np.tile(2.0 * np.arange(1, n + 1), n_runs), np.stack([run, run], axis=1)
+    return probability, NAMES[truth], np.tile(2.0 * np.arange(1, n + 1), n_runs), np.stack([run, run], axis=1)
 
 
 def chosen(seed, novelty=None, **drawn):
     """Return the settings for drawn windows, and how often single windows and the filter are right."""
-    classifier, terrain, end_s, groups = held_out(seed, **drawn)
-    prior = dict(zip(classifier.classes_.tolist(), SHARES.tolist(), strict=True))
-    found = choose_settings(classifier, terrain, end_s, groups, 2.0, prior, novelty)
-    probability = classifier.inner_probability_
-    truth = np.searchsorted(classifier.classes_, terrain)
+    probability, terrain, end_s, groups = held_out(seed, **drawn)
+    found = choose_settings(probability, terrain, end_s, groups, 2.0, PRIOR, novelty)
+    truth = np.searchsorted(NAMES, terrain)
     single = np.mean(probability.argmax(axis=1) == truth)
     if found is None:
         return None, single, single
@@ -176,14 +174,12 @@ def test_power_and_weight_follow_what_held_out_windows_show():
 
 
 def test_single_windows_are_taken_where_belief_is_always_late_and_what_is_preferred_without_windows():
-    classifier, terrain, end_s, groups = held_out(0)
-    prior = dict.fromkeys(classifier.classes_.tolist(), 1 / 3)
-    terrain = classifier.classes_[np.arange(len(terrain)) % 3]  # another ground in every window
-    always_right = np.where(terrain[:, None] == classifier.classes_, 0.6, 0.2)
-    classifier.inner_probability_ = always_right
-    assert choose_settings(classifier, terrain, end_s / 8, groups, 0.25, prior) is None
-    classifier.inner_probability_ = np.full_like(always_right, np.nan)
-    for known in (classifier, SimpleNamespace(classes_=classifier.classes_)):
+    _, terrain, end_s, groups = held_out(0)
+    prior = dict.fromkeys(NAMES.tolist(), 1 / 3)
+    terrain = NAMES[np.arange(len(terrain)) % 3]  # another ground in every window
+    always_right = np.where(terrain[:, None] == NAMES, 0.6, 0.2)
+    assert choose_settings(always_right, terrain, end_s / 8, groups, 0.25, prior) is None
+    for known in (np.full_like(always_right, np.nan), None):
         found = choose_settings(known, terrain, end_s, groups, 2.0, prior)
         assert found[1:] == (SHARE_POWERS[0], NOVELTY_WEIGHTS[0])
 
@@ -207,13 +203,12 @@ def test_what_means_nothing_or_does_not_fit_is_refused():
 
 
 def test_what_is_distinguished_is_counted_over_sessions(monkeypatch):
-    classifier, terrain, end_s, groups = held_out(0)
+    probability, terrain, end_s, groups = held_out(0)
     session = np.char.add("session of ", terrain)
     session[: len(session) // 2] = np.char.add(session[: len(session) // 2], " before")
     seen, error = [], constants._standard_error
     monkeypatch.setattr(
         constants, "_standard_error", lambda each, unit: seen.append(unit) or error(each, unit)
     )
-    prior = dict(zip(classifier.classes_.tolist(), SHARES.tolist(), strict=True))
-    choose_settings(classifier, terrain, end_s, np.stack([session, groups[:, 1]], axis=1), 2.0, prior)
+    choose_settings(probability, terrain, end_s, np.stack([session, groups[:, 1]], axis=1), 2.0, PRIOR)
     assert set(seen[0]) == set(session)
