@@ -20,7 +20,7 @@ from terrain.errors import ConfigError, DataError
 from terrain.logs.samples import refuse_implausible, usable_rows
 from terrain.logs.schema import SIGNAL_SETS, signal_set_of
 from terrain.logs.schema import TIME_TOLERANCE_S as TIME_TOLERANCE_S
-from terrain.records import Array, RunLog, Stream, Windows
+from terrain.records import WINDOW_COLUMNS, Array, RunLog, Stream, Windows
 from terrain.signals import resampled
 
 #: Runs whose rates differ by more than this cannot share windows of one length. The clocks of real loggers differ by
@@ -439,10 +439,7 @@ def join_windows(parts: Sequence[Windows]) -> Windows:
         first.channels,
         first.rate_hz,
         first.length_s,
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("start_s", "run_id", "terrain", "session")
-        ),
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in WINDOW_COLUMNS),
     )
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import partial
 from operator import attrgetter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -249,6 +250,9 @@ class SlipTrack:
         return Stream(self.time_s, self.slip_ratio, tuple(f"slip_{wheel}_ratio" for wheel in self.wheels))
 
 
+WINDOW_COLUMNS = ("start_s", "run_id", "terrain", "session")  #: Of :class:`Windows`, one entry a window
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Windows:
     """Equal cuts from run logs: the samples that scikit-learn sees.
@@ -264,20 +268,19 @@ class Windows:
     start_s: Array  #: (n_windows,) start on the clock of the run
     run_id: Array  #: (n_windows,) run of each window
     terrain: Array  #: (n_windows,) label, ``""`` where there is none
-    session: Array | None = (
-        None  #: (n_windows,) of the run of each, ``""`` where it names none; none by default
-    )
+    #: (n_windows,) of the run of each window, ``""`` where it names none; none by default
+    session: Array = field(default_factory=partial(np.empty, 0, dtype=object))
 
     def __post_init__(self) -> None:
         for name in ("values", "channels", "rate_hz"):
             object.__setattr__(self, name, dict(getattr(self, name)))
         n = len(self.start_s)
-        if self.session is None:
+        if not len(self.session):
             object.__setattr__(self, "session", np.full(n, "", dtype=object))
         for name, values in self.values.items():
             if values.ndim != 3 or values.shape[:2] != (n, len(self.channels[name])):
                 raise ValueError(f"stream {name}: shape {values.shape} does not fit {n} windows")
-        if not len(self.run_id) == len(self.terrain) == len(self.session) == n:  # type: ignore[arg-type]
+        if not len(self.run_id) == len(self.terrain) == len(self.session) == n:
             raise ValueError("start_s, run_id, terrain and session must have one entry a window")
 
     def __len__(self) -> int:
@@ -293,7 +296,7 @@ class Windows:
         >>> Windows({}, {}, {}, 2.0, np.zeros(2), run, run, np.array(["monday", ""], dtype=object)).groups.tolist()
         [['monday', 'a'], ['b', 'b']]
         """
-        session, run = np.asarray(self.session, dtype=str), self.run_id.astype(str)
+        session, run = self.session.astype(str), self.run_id.astype(str)
         return np.stack([np.where(session == "", run, session), run], axis=1)
 
     @property
@@ -329,8 +332,7 @@ class Windows:
         if isinstance(index, int | np.integer):
             index = [int(index)]
         values = {name: values[index] for name, values in self.values.items()}
-        of_each = {name: getattr(self, name)[index] for name in ("start_s", "run_id", "terrain", "session")}
-        return replace(self, values=values, **of_each)
+        return replace(self, values=values, **{name: getattr(self, name)[index] for name in WINDOW_COLUMNS})
 
 
 class TargetStatus(StrEnum):

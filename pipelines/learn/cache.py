@@ -37,7 +37,7 @@ from terrain.errors import ConfigError, DataError, LogError
 from terrain.files.atomic import atomic_file, ensure_writable
 from terrain.logs.duplicates import RunPrint, possible_pairs, run_print, sentences, shared_stretches
 from terrain.logs.run_folders import data_digest, joint_digest
-from terrain.records import Array, RunLog, Stream, Windows
+from terrain.records import WINDOW_COLUMNS, Array, RunLog, Stream, Windows
 
 FORMAT_VERSION = 7
 
@@ -236,7 +236,7 @@ def _table(
         n = len(columns["terrain"])
         parts.append({**columns, **{key: np.full(n, text, dtype=object) for key, text in names.items()}})
     table = {name: np.concatenate([part.pop(name) for part in parts]) for name in list(parts[0])}
-    of_windows = (table[name] for name in ("start_s", "run_id", "terrain", "session"))
+    of_windows = (table[name] for name in WINDOW_COLUMNS)
     windows = Windows({}, {}, {}, rule.length_s, *of_windows)
     cut, known = labelled(WindowCut(windows, dropped)), table["terrain"] != ""
     features = table["features"][known]

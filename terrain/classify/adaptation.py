@@ -35,7 +35,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.errors import ConfigError, DataError
-from terrain.records import Array, Windows
+from terrain.records import WINDOW_COLUMNS, Array, Windows
 
 GAIN_STD, OFFSET_STD = 0.2, 0.1
 """Between sessions, where none tell: gains of 0.6 to 1.4 (two standard deviations) hold an added load of 40 %;
@@ -54,7 +54,6 @@ WIDTHS = (0.1, 0.2, 0.4)  #: Of "driven nearly alike", among which held-out runs
 MAX_ROWS = 400  #: Training windows of a ground and session that are kept, thinned evenly.
 AT_ONCE_VALUES = 8_000_000  #: Of differences between windows and kept ones: 64 MB.
 MIN_GAIN = 0.2
-_OF_EACH = ("start_s", "run_id", "terrain", "session")
 TIME_TOLERANCE_S = 1e-6
 N_DRAWS = 1024
 KINDS = {"currents": ("gain of currents", "offset of currents"), "imu": ("gain of vibration",)}
@@ -145,7 +144,7 @@ def learn_adaptation(
     fastest = float(np.linalg.norm(_speeds(windows, wheels), axis=1).max(initial=1e-9))
     motion, level, terrain = _motion(windows, wheels, fastest), y / scale, windows.terrain.astype(str)
     classes = tuple(np.unique(terrain).tolist())
-    session, run = np.asarray(windows.session, dtype=str), windows.run_id.astype(str)
+    session, run = windows.session.astype(str), windows.run_id.astype(str)
     best: tuple[float, float, Array, Array] | None = None
     for of_session in (session, np.full(len(run), "")):  # of all runs, where no session has two on a terrain
         for width in WIDTHS:
@@ -314,8 +313,8 @@ def corrected(adaptation: Adaptation, windows: Windows, theta: Array) -> Windows
             else:
                 shift[:, :, row, 0] = np.outer(1.0 - 1.0 / gain[:, j], mean)
         values[stream] = np.maximum(x * scale + shift, least).reshape(-1, *x.shape[1:])
-    of_each = [np.tile(getattr(windows, name), len(theta)) for name in _OF_EACH]
-    return Windows(values, windows.channels, windows.rate_hz, windows.length_s, *of_each)
+    columns = [np.tile(getattr(windows, name), len(theta)) for name in WINDOW_COLUMNS]
+    return Windows(values, windows.channels, windows.rate_hz, windows.length_s, *columns)
 
 
 def _of_levels(adaptation: Adaptation, theta: Array) -> tuple[Array, Array]:
@@ -449,9 +448,7 @@ def _motion(windows: Windows, wheels: Sequence[tuple[str, str]], fastest: float)
 
 def _thinned(windows: Windows) -> Array:
     """Return the rows (r,) that are kept of each terrain and session."""
-    names = np.char.add(
-        np.char.add(windows.terrain.astype(str), "\n"), np.asarray(windows.session, dtype=str)
-    )
+    names = np.char.add(np.char.add(windows.terrain.astype(str), "\n"), windows.session.astype(str))
     parts = [np.flatnonzero(names == name) for name in np.unique(names)]
     return np.sort(np.concatenate([rows[:: -(-len(rows) // MAX_ROWS)] for rows in parts]))
 

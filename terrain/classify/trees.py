@@ -54,7 +54,16 @@ class Forest(NamedTuple):
 
 
 @njit
-def _sums(X, feature, threshold, left, right, outputs, roots, start):  # type: ignore[no-untyped-def]
+def _sums(
+    X: Array,
+    feature: Array,
+    threshold: Array,
+    left: Array,
+    right: Array,
+    outputs: Array,
+    roots: Array,
+    start: Array,
+) -> Array:
     sums = np.empty((X.shape[0], outputs.shape[1]))
     for i in range(X.shape[0]):
         sums[i] = start

@@ -5,7 +5,7 @@ import pytest
 from sklearn.utils import _safe_indexing, indexable
 from sklearn.utils.validation import _num_samples
 
-from terrain.records import Windows
+from terrain.records import WINDOW_COLUMNS, Windows
 
 WINDOWS = Windows(
     {"imu": np.arange(36.0).reshape(6, 2, 3), "wheels": np.arange(24.0).reshape(6, 1, 4)},
@@ -15,8 +15,8 @@ WINDOWS = Windows(
     np.arange(6.0),
     np.array(list("aabbcc"), dtype=object),
     np.array(["ice", "ice", "mud", "mud", "ice", "ice"], dtype=object),
+    np.array(["monday", "monday", "", "", "tuesday", "tuesday"], dtype=object),
 )
-PER_WINDOW = ("start_s", "run_id", "terrain")
 MASK = np.array([False, True, False, True, False, False])
 INDICES = [(np.array([4, 0, 0]), [4, 0, 0]), (MASK, [1, 3]), (slice(1, 5, 2), [1, 3]), ([5, -1], [5, 5])]
 INDICES += [(2, [2]), (np.int64(3), [3]), (np.empty(0, dtype=int), [])]
@@ -33,12 +33,12 @@ def test_an_index_selects_the_same_rows_of_every_field_and_scikit_learn_takes_th
         assert found.shape == (len(rows), 10)
         for name, values in WINDOWS.values.items():
             np.testing.assert_array_equal(found.values[name], values[rows])
-        for name in PER_WINDOW:
+        for name in WINDOW_COLUMNS:
             np.testing.assert_array_equal(getattr(found, name), getattr(WINDOWS, name)[rows])
         assert (found.channels, found.rate_hz, found.length_s) == (WINDOWS.channels, WINDOWS.rate_hz, 1.0)
 
 
-@pytest.mark.parametrize("field", PER_WINDOW)
+@pytest.mark.parametrize("field", WINDOW_COLUMNS)
 def test_fields_of_different_lengths_are_refused(field):
     fields = {name: getattr(WINDOWS, name) for name in Windows.__dataclass_fields__}
     with pytest.raises(ValueError, match=r"one entry a window|does not fit"):
