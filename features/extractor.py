@@ -319,10 +319,9 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
                 parts.append(channel_correlations(values[:, rows]))
                 features += _pairs(stream, tuple(names[i] for i in rows), signal_set)
         if selected:
-            for made, table in (
-                of(selected, self.layout_.channels) for of in (speed_features, slip_features)
-            ):
-                features += made
+            for derive in (speed_features, slip_features):
+                derived_features, table = derive(selected, self.layout_.channels)
+                features += derived_features
                 parts.append(table)
         return features, np.concatenate(parts, axis=1)
 
@@ -390,16 +389,9 @@ class PlainExtractor(FeatureExtractor):
         features, parts = list[Feature](), [np.empty((len(windows), 0))]
         for stream, values in self.selected(windows).items():
             names = self.layout_.channels[stream]
-            for name, of_window in (("mean", values.mean(axis=2)), ("std", values.std(axis=2))):
-                parts.append(of_window)
-                features += [
-                    Feature(
-                        f"{stream}.{channel.rpartition('_')[0]}.{name}",
-                        UNIT_SYMBOLS[unit_of(channel)],
-                        frozenset({signal_set_of(stream, channel) or ""}),
-                    )
-                    for channel in names
-                ]
+            for name, table in (("mean", values.mean(axis=2)), ("std", values.std(axis=2))):
+                features += _described(stream, names, ((name, "x"),), frozenset(SIGNAL_SETS))[0]
+                parts.append(table)
         return features, np.concatenate(parts, axis=1)
 
 

@@ -25,10 +25,8 @@ from terrain.records import Array, Windows
 #: SVM and trees on features, network on samples, SVM and network joined, and which of these four held-out runs favour;
 #: what wheels answer to how they are driven; and a baseline, boosted trees on means and standard deviations.
 RECIPES = ("svm", "trees", "cnn", "stack", "best", "response", "plain")
-WITH_FUNCTIONS = (
-    "svm",
-    "trees",
-)  #: Recipes that take own functions of a window, as one's own classifiers do.
+#: Recipes that take own functions of a window, as one's own classifiers do.
+WITH_FUNCTIONS = ("svm", "trees")
 
 
 class WindowPipeline(Pipeline):

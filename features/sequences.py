@@ -53,8 +53,7 @@ def follow(
         single = filtered = last_class(probability)
         if settings is not None:
             filtered = reported(filter_run(probability, starts_s + rule.length_s, settings))
-        reports = filtered, single
-        tracks.append(track_of(log.labels, runs, starts_s, rule.length_s, *reports, classes, spliced))
+        tracks.append(track_of(log.labels, runs, starts_s, rule.length_s, filtered, single, classes, spliced))
     return tracks
 
 
@@ -71,10 +70,8 @@ def following(
     These are one that is spliced of all parts of the runs, each second at most once, and the runs over several grounds.
     ``features`` transforms windows, and learns nothing but their channels and rates; the folds number ``windows``.
     """
-    by_id, layout = (
-        {run.run_id: run for run in runs},
-        Layout(windows.channels, windows.rate_hz, windows.rate_hz),
-    )
+    by_id = {run.run_id: run for run in runs}
+    layout = Layout(windows.channels, windows.rate_hz, windows.rate_hz)
     classes, class_of = np.unique(windows.terrain.astype(str), return_inverse=True)
     for repeat, number, train, test in folds:
         rng = np.random.default_rng((seed, repeat, number))

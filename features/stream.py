@@ -82,7 +82,6 @@ class WindowStream:
     ----------
     dropped : windows dropped so far, by reason (:data:`~features.windows.DROP_REASONS`)
     dropped_samples : samples dropped so far, by stream and reason
-    resampled : in a sentence, each stream whose windows are resampled
 
     Examples
     --------
@@ -107,13 +106,12 @@ class WindowStream:
         self.layout = layout
         self.dropped: Counter[str] = Counter()
         self.dropped_samples: Counter[tuple[str, str]] = Counter()
-        self.resampled: tuple[str, ...] = ()
         self._own, self._judged, self._refused = layout, not layout.least_hz, ""
-        self._n_samples = {name: layout.n_samples(name, rule.length_s) for name in layout.channels}
-        if rule.steady is not None:  # refused now and not at the first window
+        for name in layout.channels:  # too few are refused now and not at the first window
+            layout.n_samples(name, rule.length_s)
+        if rule.steady is not None:  # so is a rule that needs wheel speeds where there are none
             empty = {name: np.empty((0, len(names), 0)) for name, names in layout.channels.items()}
             wheel_speeds(empty, layout.channels)
-        self._period_s = {name: 1 / layout.rate_hz[name] for name in layout.channels}
         self._buffers = {
             name: _Buffer(self._capacity(layout.rate_hz[name]), len(channels))
             for name, channels in layout.channels.items()
@@ -127,25 +125,30 @@ class WindowStream:
         """No sample before this time can finish a window; minus infinity before all streams have begun."""
         return min(self._due_s.values())
 
+    @property
+    def resampled(self) -> tuple[str, ...]:
+        """In a sentence, each stream whose windows are resampled."""
+        return self.layout.resampled_from(self._own)
+
     def _capacity(self, rate_hz: float) -> int:
         span_s = self.rule.length_s + self.rule.step_s + PATIENCE_S
         return max(_MIN_BUFFER, math.ceil(BUFFER_MARGIN * span_s * rate_hz))
 
     def _take_rates(self) -> None:
         """Cut from now on at the rates that the first samples have, or drop all windows where these are too low."""
-        self._judged, rate_hz, channels = True, dict(self.layout.rate_hz), self.layout.channels
+        self._judged, rate_hz = True, dict(self.layout.rate_hz)
         try:
             for name, buffer in self._buffers.items():
                 if len(buffer.time_s) > 1:
                     step_s = float(np.median(np.diff(buffer.time_s)))
                     rate_hz[name] = self.layout.cut_hz(name, 1.0 / step_s)
                     buffer.capacity = self._capacity(rate_hz[name])
-            self._own = Layout(channels, rate_hz)
-            self._n_samples = {name: self._own.n_samples(name, self.rule.length_s) for name in channels}
-            self._period_s = {name: 1 / rate_hz[name] for name in channels}
-            self.resampled = self.layout.resampled_from(self._own)
+            own = Layout(self.layout.channels, rate_hz)
+            for name in own.channels:
+                own.n_samples(name, self.rule.length_s)
+            self._own = own
         except DataError as error:
-            self._own, self._refused = self.layout, str(error)
+            self._refused = str(error)
 
     def push(self, stream: str, time_s: float, values: Sequence[float] | Array) -> list[Windows]:
         """Take one sample and return the windows that it completes, each a ``Windows`` of length 1.
@@ -214,14 +217,13 @@ class WindowStream:
 
     def _set_due(self) -> None:
         """Set the time before which no sample can finish the next window."""
-        start_s = self._start_s + self.rule.step_s * self._next
-        for name, period_s in self._period_s.items():
-            self._due_s[name] = start_s + self.rule.length_s - 2 * TIME_TOLERANCE_S - period_s
+        end_s = self._start_s + self.rule.step_s * self._next + self.rule.length_s - 2 * TIME_TOLERANCE_S
+        self._due_s = {name: end_s - 1 / self._own.rate_hz[name] for name in self._buffers}
 
     def _n_decided(self) -> tuple[int, int]:
         """Return the numbers of windows that fit, by the formula of `regular_starts`, and that wait no longer."""
         front_s = max(buffer.last_s for buffer in self._buffers.values())
-        reached_s = min(buffer.last_s + self._period_s[name] for name, buffer in self._buffers.items())
+        reached_s = min(each.last_s + 1 / self._own.rate_hz[name] for name, each in self._buffers.items())
         n_fit, n_overdue = (
             math.floor((end_s - self._start_s - self.rule.length_s + TIME_TOLERANCE_S) / self.rule.step_s) + 1
             for end_s in (reached_s, front_s - PATIENCE_S)
@@ -244,7 +246,7 @@ class WindowStream:
             start_s, streams = self._start_s + rule.step_s * self._next, {}
             for name, buffer in self._buffers.items():
                 first = bisect_left(buffer.time_s, start_s - TIME_TOLERANCE_S)
-                rows = slice(first, first + self._n_samples[name])
+                rows = slice(first, first + self._own.n_samples(name, rule.length_s))
                 if rows.stop <= len(buffer.time_s):
                     samples = np.array(buffer.time_s[rows]), np.array(buffer.values[rows])
                     streams[name] = Stream(*samples, channels[name])

@@ -130,10 +130,11 @@ class Layout:
 
     def resampled_from(self, own: Layout) -> tuple[str, ...]:
         """Return in a sentence each stream whose windows are resampled from rates at which they are cut."""
-        rates = (
-            (name, own.rate_hz[name], to_hz) for name, to_hz in self.rate_hz.items() if name in own.rate_hz
+        return tuple(
+            f"{name} resampled from {own_hz:.4g} to {self.rate_hz[name]:.4g} Hz"
+            for name, own_hz in own.rate_hz.items()
+            if own_hz != self.rate_hz[name]
         )
-        return tuple(f"{name} resampled from {a:.4g} to {b:.4g} Hz" for name, a, b in rates if a != b)
 
 
 def rows_of(channels: Sequence[str], quantity: str) -> list[int]:

@@ -65,9 +65,8 @@ class CurveEntry:
     braking_energy_jpm: Finite
     steady_energy_jpm: Finite
     n_runs: Annotated[int, Field(strict=True, ge=1)]  #: the curve is fitted to
-    n_sessions: Annotated[int, Field(strict=True, ge=0)] = (
-        0  #: of these runs; those that name none are of one
-    )
+    #: of these runs; those that name none are of one
+    n_sessions: Annotated[int, Field(strict=True, ge=0)] = 0
 
     def thrust_ratio(self, slip_ratio: Array) -> Array:
         """Return the thrust over load (n,) at each slip (n,)."""

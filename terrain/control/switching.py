@@ -161,9 +161,8 @@ class TerrainEstimate(NamedTuple):
     time_s: float
     terrain: str
     probability: float
-    reason: str = (
-        ""  #: why the terrain is unknown, in words; empty where it is not, or nothing is known of it
-    )
+    #: why the terrain is unknown, in words; empty where it is not, or nothing is known of it
+    reason: str = ""
 
 
 class TerrainSource:

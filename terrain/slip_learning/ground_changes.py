@@ -21,9 +21,8 @@ from terrain.robots import Robot
 from terrain.slip_learning.measured import measured_slip, outside_source, wheel_speeds
 
 WINDOW_S, STRIDE_S = 0.5, 0.1
-MAX_DELAY_S = (
-    3.0  #: Later alarms are none of the change: three blocks before one, and the crossing's second half
-)
+#: Later alarms are none of the change: three blocks before one, and the crossing's second half
+MAX_DELAY_S = 3.0
 
 SETTLING_S = 0.4  #: Windows that begin earlier have the start in them
 MIN_WINDOWS = 5  #: On each side of the instant

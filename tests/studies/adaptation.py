@@ -92,23 +92,20 @@ def run(settings: Settings, progress: Progress = silent) -> AdaptationStudy:
 def _changed(windows: Windows, adaptation: Adaptation | None, own: bool, rng: np.random.Generator) -> Windows:
     """Return windows of a session whose shift is drawn; of each terrain a further one where it has its own."""
     assert adaptation is not None
-    drawn = {
-        "gain of currents": rng.uniform(*GAINS),
-        "offset of currents": OFFSET_STD * rng.standard_normal(),
-        "gain of vibration": rng.uniform(*SHAKING),
-    }
+    of_all = rng.uniform(*GAINS), OFFSET_STD * rng.standard_normal()
+    shaking = rng.uniform(*SHAKING)
     parts = []
     for terrain in adaptation.classes:
-        gain, offset, shaking = drawn.values()
+        gain, offset = of_all
         if own:
             gain, offset = gain + OWN_GAIN_STD * rng.standard_normal(), offset + 0.05 * rng.standard_normal()
-        # what undoes the shift that is hidden: (x - b) / (1 + a) with these is g x + o
-        undone = {
+        # the inverse of the shift that is hidden: (x - b) / (1 + a) with these is g x + o
+        inverse = {
             "gain of currents": 1.0 / gain - 1.0,
             "offset of currents": -offset / gain,
             "gain of vibration": 1.0 / shaking - 1.0,
         }
-        theta = np.array([undone[name] for name in adaptation.parameters])
+        theta = np.array([inverse[name] for name in adaptation.parameters])
         parts.append(corrected(adaptation, windows[windows.terrain == terrain], theta))
     return join_windows(parts)
 

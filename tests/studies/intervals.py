@@ -11,13 +11,13 @@ from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import betaincinv
 from scipy.stats import truncnorm
 
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
 from pipelines.report.tree import Column, Report, Table
+from terrain.bootstrap import proportion_interval
 from terrain.calibration.description import findings_of
 from terrain.calibration.lag import STAMP_S
 from terrain.calibration.odometry import SLIP, fit_odometry, legs_of_poses, level
@@ -352,14 +352,6 @@ def _slip_peak(seed: int) -> Iterator[Interval]:
     yield Interval("peak", *curve.peak_interval, true.slip_ratio, curve.peak.slip_ratio)
 
 
-def clopper_pearson(hits: int, n: int, level: float = 0.95) -> tuple[float, float]:
-    """Return the exact interval of a probability by ``hits`` of ``n``."""
-    tail = (1 - level) / 2
-    low = float(betaincinv(hits, n - hits + 1, tail)) if hits else 0.0
-    high = float(betaincinv(hits + 1, n - hits, 1 - tail)) if hits < n else 1.0
-    return low, high
-
-
 USES: dict[str, tuple[Callable[[int], Iterator[Interval]], float]] = {
     "regression": (_regression, 0.95),
     "six-positions": (_six_positions, 0.95),
@@ -411,7 +403,7 @@ def _covered(use: str, name: str, intervals: list[Interval], stated: float) -> C
     middles = [each.value if np.isfinite(each.value) else (each.low + each.high) / 2 for each in intervals]
     errors = np.abs(np.array(middles) - [each.truth for each in intervals])
     median, largest = float(np.median(errors)), float(errors.max())
-    return Covered(use, name, n, hits / n, clopper_pearson(hits, n), stated, median, largest)
+    return Covered(use, name, n, hits / n, proportion_interval(hits, n), stated, median, largest)
 
 
 def report(result: IntervalsResult) -> Report:

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import beta
 
 from studies.blind_trials.trial import DRIVE_ROWS, FAULTS, KNOWN, OUTSIDE, ROBOTS, Row, Trial, value_is_right
+from terrain.bootstrap import proportion_interval
 from terrain.discrepancy.verdict import Verdict
 from terrain.effects import library_of
 from terrain.records import Array
@@ -43,11 +43,8 @@ def score(outcomes: Iterable[bool], least: float = 0.0, most: float = 1.0, n_lea
     n, k = len(counted), sum(counted)
     words = [f"at least {100 * least:.0f} %"] * (least > 0.0) + [f"at most {100 * most:.0f} %"] * (most < 1.0)
     bar = " and ".join(words) + f", of at least {n_least}" * (n_least > 0)
-    if n == 0:
-        return Score(0, 0, math.nan, 0.0, 1.0, bar, False)
-    low = float(beta.ppf(0.025, k, n - k + 1)) if k > 0 else 0.0
-    high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
-    return Score(k, n, k / n, low, high, bar, least <= k / n <= most and n >= n_least)
+    rate = k / n if n else math.nan
+    return Score(k, n, rate, *proportion_interval(k, n), bar, least <= rate <= most and n >= n_least)
 
 
 def table_of(trials: Sequence[Trial]) -> dict[str, Score]:
