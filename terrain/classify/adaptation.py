@@ -30,6 +30,7 @@ Gains of wheel speeds cannot be distinguished from slip by what a window holds, 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -89,9 +90,8 @@ class Adaptation(NamedTuple):
     window_std: Array
     prior_std: Array  #: (d,) of theta between sessions
     n_sessions: int  #: that it was learned from
-    shown: bool = (
-        False  #: whether inner sessions show a gain by the start of a session, so that it is used unasked
-    )
+    #: whether inner sessions show a gain by the start of a session, so that it is used unasked
+    shown: bool = False
     status: str = "not shown: never judged"
     #: of a session's start that is taken for a reference, "" where that is not known; None: no start is taken
     start: str | None = None
@@ -100,7 +100,19 @@ class Adaptation(NamedTuple):
     @property
     def found(self) -> str:
         """What was found, in a sentence; empty without a shift."""
-        return "" if self.shift is None or not self.shift.length_s else _sentence(self, self.shift)
+        if (shift := self.shift) is None or not shift.length_s:
+            return ""
+        c = self.classes.index(shift.terrain) if shift.terrain else 0
+        std, parts = np.sqrt(np.diagonal(shift.cov[c])), []
+        for name, value, deviation in zip(self.parameters, shift.mean[c], std, strict=True):
+            if name.startswith("offset"):
+                unit = self.scale[_are_currents(self.levels)][0]
+                parts.append(f"{value * unit:+.2f} A (+- {deviation * unit:.2f}) offset")
+            else:
+                what = name.rpartition(" ")[2]
+                parts.append(f"{what} {1.0 + value:.2f} (+- {deviation:.2f}) times those of training")
+        where = f"on {shift.terrain}" if shift.terrain else "on a ground that was not named"
+        return f"{', '.join(parts)}, from {shift.length_s:.0f} s {where}"
 
     def of_start(self, terrain: str = "") -> Adaptation:
         """Return the adaptation as a session begins with it: any shift of the prior, until its start was a reference.
@@ -134,28 +146,26 @@ def learn_adaptation(
         raise DataError("the windows hold neither motor currents nor an IMU, whose levels could be compared")
     kept = _thinned(windows)
     windows = windows[kept]
-    y, parts = _levels(windows, levels), [_is_current(name) for name in levels]
+    y, current = _levels(windows, levels), _are_currents(levels)
     scale = np.maximum(np.median(y, axis=0), 1e-9)
-    scale[parts] = np.median(y[:, parts]) if any(parts) else 1.0
+    if current.any():
+        scale[current] = np.median(y[:, current])
     scale = np.where(scale > 0.0, scale, 1.0)
-    kinds = [kind for kind, is_in in (("currents", any(parts)), ("imu", not all(parts))) if is_in]
+    kinds = [kind for kind, there in (("currents", current.any()), ("imu", not current.all())) if there]
     parameters = tuple(name for kind in kinds for name in KINDS[kind])
     default = np.array([OFFSET_STD if name.startswith("offset") else GAIN_STD for name in parameters])
     fastest = float(np.linalg.norm(_speeds(windows, wheels), axis=1).max(initial=1e-9))
     motion, level, terrain = _motion(windows, wheels, fastest), y / scale, windows.terrain.astype(str)
     classes = tuple(np.unique(terrain).tolist())
     session, run = windows.session.astype(str), windows.run_id.astype(str)
-    best: tuple[float, float, Array, Array] | None = None
     for of_session in (session, np.full(len(run), "")):  # of all runs, where no session has two on a terrain
-        for width in WIDTHS:
-            scatter = _scatter(motion, level, terrain, of_session, run, width)
-            if scatter is not None and (best is None or scatter[0] < best[0]):
-                best = scatter[0], width, *scatter[1:]
-        if best is not None:
+        scatters = [(_scatter(motion, level, terrain, of_session, run, width), width) for width in WIDTHS]
+        known = [(*scatter, width) for scatter, width in scatters if scatter is not None]
+        if known:
             break
-    if best is None:
+    else:
         raise DataError("no terrain has two runs, so that the scatter of runs is not known")
-    _, width, run_std, window_std = best
+    _, run_std, window_std, width = min(known, key=itemgetter(0))
     of = np.searchsorted(classes, terrain)
     learned = Adaptation(
         classes, tuple(levels), tuple(wheels), scale, parameters, motion, level, of, fastest, width,
@@ -213,14 +223,12 @@ def check_adaptation(adaptation: Adaptation, classes: Sequence[str]) -> None:
     """Refuse by ``DataError`` what does not fit these terrains or itself, or is not of finite numbers."""
     m, d, p = len(adaptation.levels), len(adaptation.parameters), len(adaptation.of)
     k, n_wheels, shift = len(classes), max(len(adaptation.wheels), 1), adaptation.shift
-    shapes = {
-        "scale": (m,),
-        "motion": (p, n_wheels + 1),
-        "level": (p, m),
-        "run_std": (m,),
-        "window_std": (m,),
-    }
-    arrays = [(getattr(adaptation, name), shape) for name, shape in (shapes | {"prior_std": (d,)}).items()]
+    positive = adaptation.scale, adaptation.run_std, adaptation.window_std, adaptation.prior_std
+    arrays: list[tuple[Array, tuple[int, ...]]] = [
+        *zip(positive, ((m,), (m,), (m,), (d,)), strict=True),
+        (adaptation.motion, (p, n_wheels + 1)),
+        (adaptation.level, (p, m)),
+    ]
     if shift is not None:
         arrays += [(shift.mean, (k, d)), (shift.cov, (k, d, d))]
     if adaptation.classes != tuple(classes) or set(adaptation.of.tolist()) != set(range(k)):
@@ -230,7 +238,6 @@ def check_adaptation(adaptation: Adaptation, classes: Sequence[str]) -> None:
     for array, shape in arrays:
         if array.shape != shape or array.dtype.kind != "f" or not np.isfinite(array).all():
             raise DataError(f"what it adapts by holds no {shape} finite numbers")
-    positive = adaptation.scale, adaptation.run_std, adaptation.window_std, adaptation.prior_std
     if min(each.min() for each in positive) <= 0.0 or min(adaptation.fastest, adaptation.width) <= 0.0:
         raise DataError("what it adapts by has scales that are not above zero")
 
@@ -294,8 +301,9 @@ def corrected(adaptation: Adaptation, windows: Windows, theta: Array) -> Windows
 
     They follow each other theta by theta.
     """
-    theta = np.atleast_2d(theta)
-    gain, offset = _of_levels(adaptation, theta)
+    theta, current = np.atleast_2d(theta), _are_currents(adaptation.levels)
+    gains, offsets = _parts_of_levels(adaptation)
+    gain, offset = np.maximum(1.0 + theta @ gains.T, MIN_GAIN), theta @ offsets.T
     values = {}
     for stream, x in windows.values.items():
         scale, shift = np.ones((len(theta), 1, x.shape[1], 1)), np.zeros((len(theta), *x.shape[:2], 1))
@@ -306,7 +314,7 @@ def corrected(adaptation: Adaptation, windows: Windows, theta: Array) -> Windows
             row = _place(windows, stream, name)
             mean = x[:, row].mean(axis=1)
             scale[:, 0, row, 0] = 1.0 / gain[:, j]
-            if _is_current((stream, name)):  # one that has a sign is shifted along it, a magnitude stays one
+            if current[j]:  # one that has a sign is shifted along it, a magnitude stays one
                 along = np.where(mean < 0.0, -adaptation.scale[j], adaptation.scale[j])
                 shift[:, :, row, 0] = -np.outer(offset[:, j] / gain[:, j], along)
                 least[:, row, 0] = np.where((x[:, row] >= 0.0).all(axis=1), 0.0, -np.inf)
@@ -317,24 +325,18 @@ def corrected(adaptation: Adaptation, windows: Windows, theta: Array) -> Windows
     return Windows(values, windows.channels, windows.rate_hz, windows.length_s, *columns)
 
 
-def _of_levels(adaptation: Adaptation, theta: Array) -> tuple[Array, Array]:
-    """Return gains and offsets (p, m), in units of the levels, of theta (p, d)."""
-    places = {name: i for i, name in enumerate(adaptation.parameters)}
-    current = np.array([_is_current(each) for each in adaptation.levels])
-    gains = [KINDS["currents" if is_current else "imu"][0] for is_current in current]
-    gain = np.maximum(1.0 + theta[:, [places[name] for name in gains]], MIN_GAIN)
-    offset = theta[:, [places.get("offset of currents", 0)]]
-    return gain, np.where(current, offset, 0.0)
+def _parts_of_levels(adaptation: Adaptation) -> tuple[Array, Array]:
+    """Return which parameter is the gain of each level, and which its offset: (m, d) each, of 0 and 1."""
+    current = _are_currents(adaptation.levels)
+    own = np.stack([current == name.endswith("currents") for name in adaptation.parameters], axis=1)
+    offset = np.array([name.startswith("offset") for name in adaptation.parameters])
+    return 1.0 * (own & ~offset), 1.0 * (own & offset)
 
 
 def _design(adaptation: Adaptation, level: Array) -> Array:
     """Return the derivative (m, d) of expected levels (m,) by theta."""
-    columns = []
-    for name in adaptation.parameters:
-        current = np.array([_is_current(each) for each in adaptation.levels])
-        of_it = current if name.endswith("currents") else ~current
-        columns.append(of_it * (1.0 if name.startswith("offset") else level))
-    return np.stack(columns, axis=1)
+    gains, offsets = _parts_of_levels(adaptation)
+    return gains * level[:, None] + offsets
 
 
 def _observed(adaptation: Adaptation, windows: Windows, c: int) -> tuple[Array, Array]:
@@ -425,9 +427,9 @@ def _law(motion: Array, known: Array, level: Array, width: float, runs: Array | 
 def _levels(windows: Windows, levels: Sequence[tuple[str, str]]) -> Array:
     """Return the level (n, m) of each channel in its unit; ``DataError`` where one is missing."""
     columns = []
-    for stream, name in levels:
+    for (stream, name), current in zip(levels, _are_currents(levels), strict=True):
         x = windows.values[stream][:, _place(windows, stream, name)]
-        columns.append(np.abs(x).mean(axis=1) if _is_current((stream, name)) else x.std(axis=1))
+        columns.append(np.abs(x).mean(axis=1) if current else x.std(axis=1))
     return np.stack(columns, axis=1)
 
 
@@ -462,20 +464,5 @@ def _place(windows: Windows, stream: str, name: str) -> int:
         ) from None
 
 
-def _is_current(level: tuple[str, str]) -> bool:
-    return level[1].startswith("current_")
-
-
-def _sentence(adaptation: Adaptation, shift: Shift) -> str:
-    c = adaptation.classes.index(shift.terrain) if shift.terrain else 0
-    mean, std = shift.mean[c], np.sqrt(np.diagonal(shift.cov[c]))
-    found = []
-    for name, value, deviation in zip(adaptation.parameters, mean, std, strict=True):
-        what = name.rpartition(" ")[2]
-        if name.startswith("offset"):
-            unit = adaptation.scale[[_is_current(each) for each in adaptation.levels]][0]
-            found.append(f"{value * unit:+.2f} A (+- {deviation * unit:.2f}) offset")
-        else:
-            found.append(f"{what} {1.0 + value:.2f} (+- {deviation:.2f}) times those of training")
-    where = f"on {shift.terrain}" if shift.terrain else "on a ground that was not named"
-    return f"{', '.join(found)}, from {shift.length_s:.0f} s {where}"
+def _are_currents(levels: Sequence[tuple[str, str]]) -> Array:
+    return np.array([name.startswith("current_") for _, name in levels])

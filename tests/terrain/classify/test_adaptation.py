@@ -90,20 +90,20 @@ def test_a_ground_without_a_name_is_found_where_no_gain_makes_one_of_the_other(l
     assert "on a ground that was not named" in heavy.found
 
 
-def test_nothing_shifted_changes_nothing_and_a_shift_is_undone(learned):
+def test_nothing_shifted_changes_nothing_and_a_shift_is_corrected(learned):
     windows = drives(["mud"], 3, 1)
     theta, weight = corrections(learned)
     assert weight.tolist() == [[1.0, 1.0]]
     same = corrected(learned, windows, theta)
     assert all(np.allclose(same.values[name], windows.values[name], rtol=1e-14) for name in windows.values)
-    moved = drives(["mud"], 3, 1, gain=1.0, shaking=1.4)
-    moved.values["wheels"][:, 2:] = moved.values["wheels"][:, 2:] * 1.25 + 0.1
-    back = corrected(learned, moved, np.array([0.25, 0.1 / learned.scale[0], 0.4]))
+    shifted = drives(["mud"], 3, 1, gain=1.0, shaking=1.4)
+    shifted.values["wheels"][:, 2:] = shifted.values["wheels"][:, 2:] * 1.25 + 0.1
+    back = corrected(learned, shifted, np.array([0.25, 0.1 / learned.scale[0], 0.4]))
     for name in windows.values:
         assert np.allclose(back.values[name], windows.values[name], atol=0.15 if name == "imu" else 1e-9)
-    less = corrected(learned, moved, np.array([0.0, 9.0 / learned.scale[0], 0.0]))
+    less = corrected(learned, shifted, np.array([0.0, 9.0 / learned.scale[0], 0.0]))
     assert (less.values["wheels"][:, 2:] == 0.0).all()  # a magnitude stays one
-    signed = replace(moved, values={**moved.values, "wheels": -moved.values["wheels"]})
+    signed = replace(shifted, values={**shifted.values, "wheels": -shifted.values["wheels"]})
     mirrored = corrected(learned, signed, np.array([0.25, 0.1 / learned.scale[0], 0.4]))
     assert np.allclose(mirrored.values["wheels"][:, 2:], -back.values["wheels"][:, 2:])
 
