@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
-from typing import Any
+from functools import cache, partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -151,27 +151,28 @@ def evaluate_recipe(
     held_out = evaluate(recipe[-1], examples, folds, settings.jobs, protocol, progress, asks, bool(channels))
     found: dict[str, Any] = {}
     notes = []
+    judged, dealt = settings.extras or bool(channels), (samples.terrain, samples.group, samples.gap, seed)
+    checks = cache(partial(_checks, recipe, features, samples, settings))
     if beside and computed is None:
-        found |= _extras(recipe, features, samples, held_out, settings, progress)
+        found |= _extras(checks(), samples, held_out, settings, progress)
     elif beside:
         notes.append(NO_EXTRAS)
-    if (settings.extras or channels) and windows.values:
+    if judged and windows.values:
         plain = recipe_of(settings.with_(feature=()), BASELINE)
         rows = Examples(feature_matrix(plain, windows), samples.terrain, samples.group)
         first = [fold for fold in folds if fold.repeat == 0]
         beaten = evaluate(plain[-1], rows, first, settings.jobs, BASELINE, progress)
         found["plain_accuracy"] = beaten.accuracies[0]
     if protocol == "leave-terrain-out":
-        _, checked = _of_svm(recipe, features, samples, settings)
-        terrain, group, gap = samples.terrain, samples.group, samples.gap
-        left_out = left_out_folds(terrain, group, N_FOLDS, gap, seed)
-        end_s = windows.start_s + windows.length_s
-        shared = Looks(checked, samples.observed, end_s), terrain, group, gap, seed
+        left_out = left_out_folds(*dealt[:2], N_FOLDS, *dealt[2:])
+        shared = checks().looks, *dealt
         scores = [*parallel(score_fold, shared, left_out, settings.jobs, protocol, progress)]
-        found |= unknown_figures(scores, terrain, group, windows.start_s, seed)
-    elif not published and (settings.extras or channels):
+        found |= unknown_figures(scores, *dealt[:2], windows.start_s, seed)
+    elif judged and not published:
         try:
-            found["refusals"] = _refusals(recipe, features, samples, held_out, settings, progress)
+            found["refusals"] = _refusals(
+                (checks().looks, *dealt), held_out, windows.groups, settings.jobs, progress
+            )
         except DataError as error:
             notes.append(f"no window is ever called unknown: {error}")
     if not published and protocol not in ("leave-terrain-out", "slow-fast", "fast-slow"):
@@ -219,14 +220,23 @@ def evaluation_of(held_out: HeldOut, samples: Samples, seed: int, **fields: Any)
     return replace(result, notes=result.weaknesses)
 
 
-def _of_svm(
+class Checks(NamedTuple):
+    """What the checks beside the figures are made with."""
+
+    classifier: Any
+    looks: Looks
+    own: bool  #: whether these are of the recipe that is evaluated
+
+
+def _checks(
     recipe: WindowPipeline, features: Array, samples: Samples, settings: EvaluationSettings | RecipeSettings
-) -> tuple[Any, Array]:
-    """Return the classifier and the features of the checks: those of a recipe by the SVM, else the SVM's own."""
-    if not isinstance(recipe[-1], GroupedSVC):
+) -> Checks:
+    """Return what checks are made with: classifier and features of a recipe by the SVM, else the SVM's own."""
+    if not (own := isinstance(recipe[-1], GroupedSVC)):
         recipe = recipe_of(settings, CHECKED_WITH)
         features = feature_matrix(recipe, samples.windows)
-    return recipe[-1], features
+    end_s = samples.windows.start_s + samples.windows.length_s
+    return Checks(recipe[-1], Looks(features, samples.observed, end_s), own)
 
 
 def _over_time(held_out: HeldOut, windows: Windows, unit: Array, seed: int) -> Difference | None:
@@ -263,50 +273,38 @@ def _over_time(held_out: HeldOut, windows: Windows, unit: Array, seed: int) -> D
 
 
 def _refusals(
-    recipe: WindowPipeline,
-    features: Array,
-    samples: Samples,
+    dealt: tuple[Looks, Array, Array, int, int],
     held_out: HeldOut,
-    settings: EvaluationSettings | RecipeSettings,
+    groups: Array,
+    n_jobs: int,
     progress: Progress,
 ) -> RefusalFigures:
     """Return how often the windows that the first fold assignment holds out are called unknown."""
-    _, checked = _of_svm(recipe, features, samples, settings)
-    terrain, group, rows = samples.terrain, samples.group, np.flatnonzero(held_out.tested)
-    first = [each.fold for each in held_out.results if each.fold.repeat == 0]
-    end_s = samples.windows.start_s + samples.windows.length_s
-    shared, refused = (
-        (Looks(checked, samples.observed, end_s), terrain, group, samples.gap, settings.seed),
-        np.zeros(len(terrain), dtype=bool),
-    )
-    folds = [(fold.train, fold.test) for fold in first]
-    found = parallel(refused_rows, shared, folds, settings.jobs, "refusals", progress)
-    for fold, of_fold in zip(first, found, strict=True):
-        refused[fold.test] = of_fold
-    groups = samples.windows.groups
-    return refusal_figures(
-        refused[rows], held_out.correct[0, rows], terrain[rows], groups[rows], settings.seed
-    )
+    refused, rows = np.zeros(len(held_out.truth), dtype=bool), np.flatnonzero(held_out.tested)
+    folds = [each.fold[2:] for each in held_out.results if each.fold.repeat == 0]
+    found = parallel(refused_rows, dealt, folds, n_jobs, "refusals", progress)
+    for (_, test), of_fold in zip(folds, found, strict=True):
+        refused[test] = of_fold
+    judged = held_out.correct[0, rows], held_out.truth[rows], groups[rows]
+    return refusal_figures(refused[rows], *judged, dealt[-1])
 
 
 def _extras(
-    recipe: WindowPipeline,
-    features: Array,
+    checks: Checks,
     samples: Samples,
     held_out: HeldOut,
     settings: EvaluationSettings | RecipeSettings,
     progress: Progress,
 ) -> dict[str, Any]:
     """Return the checks beside the figures, by field."""
-    classifier, features = _of_svm(recipe, features, samples, settings)
-    windows, terrain, seed = samples.windows, samples.terrain, settings.seed
+    classifier, (features, _, _), own = checks
+    windows, terrain, group, seed = samples.windows, samples.terrain, samples.group, settings.seed
     first = [result.fold for result in held_out.results if result.fold.repeat == 0]
 
     def accuracies(features: Array, folds: Sequence[Fold], task: str) -> list[float]:
-        examples = Examples(features, terrain, samples.group)
+        examples = Examples(features, terrain, group)
         return evaluate(classifier, examples, folds, settings.jobs, task, progress).accuracies
 
-    own = classifier is recipe[-1]
     full = held_out.accuracies[0] if own else accuracies(features, first, CHECKED_WITH)[0]
     speed_only = None
     if wheel_stream(windows.channels) is not None:
@@ -317,8 +315,8 @@ def _extras(
         slow, fast = np.flatnonzero(side == "slow"), np.flatnonzero(side == "fast")
         both = accuracies(features, [Fold(0, 0, slow, fast), Fold(1, 0, fast, slow)], "slow to fast")
         slow_fast = slow_fast._replace(slow_to_fast=both[0], fast_to_slow=both[1])
-    unit = "session" if has_sessions(terrain, samples.group) else "run"
-    drawn, runs_per_class = drawn_folds(terrain, samples.group, first, seed)
+    unit = "session" if has_sessions(terrain, group) else "run"
+    drawn, runs_per_class = drawn_folds(terrain, group, first, seed)
     curve = accuracies(features, drawn, "learning curve") if drawn else []
     tracks = [track for result in held_out.results for track in result.found or ()]
     spliced = sequence_figures([track for track in tracks if track.spliced], seed)
