@@ -30,7 +30,8 @@ from pipelines.learn.model_file import (
 )
 from pipelines.learn.rates import accepted
 from pipelines.learn.training_data import TrainedRun
-from pipelines.live.model import ModelInfo, assess
+from pipelines.live.assess import assess
+from pipelines.live.model import ModelInfo
 from pipelines.report.numbers import NOT_KNOWN, enumerated, format_value, sentence
 from pipelines.report.results import Result, described
 from pipelines.report.tree import Column, Pairs, Report, Section, Table, Text

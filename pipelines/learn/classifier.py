@@ -19,7 +19,7 @@ from features.recipes import WindowPipeline, make_recipe
 from features.windows import WindowCut, WindowRule, labelled, overlap_of
 from pipelines.learn.model_file import MANIFEST_FILE, model_info, read_model, write_model
 from pipelines.learn.training_data import with_limits
-from pipelines.live.model import assess
+from pipelines.live.assess import assess
 from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows

@@ -151,7 +151,7 @@ def _propose(settings: Settings, model_uri: str) -> ProposalsResult:
     import pandas as pd
 
     from pipelines.data.datasets import load_runs
-    from pipelines.live.model import assess
+    from pipelines.live.assess import assess
     from pipelines.live.windows import prior_of, windows_of_log
     from terrain.classify.proposals import propose, questions, taken_from
     from terrain.files.atomic import atomic_write

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from pipelines.learn.ground_changes import ChangesResult
-    from pipelines.live.model import Assessed, ModelInfo, TerrainModel
+    from pipelines.live.assess import Assessed
+    from pipelines.live.model import ModelInfo, TerrainModel
     from terrain.control.slip_table import SlipTable
     from terrain.records import Array, RunLog, Windows
     from terrain.robots import Robot
@@ -244,7 +245,7 @@ def predict(
     ConfigError
         if the table is for another robot than a run is of.
     """
-    from pipelines.live.model import SessionStart
+    from pipelines.live.assess import SessionStart
     from pipelines.live.windows import needs_filter, windows_of_log
     from terrain.logs.run_folders import data_digest
 
@@ -313,7 +314,7 @@ def _filtered(parts: Sequence[Windows], assessed: Sequence[Assessed], info: Mode
     """Return the column of the class that is reported over time in each window of runs; -1 for unknown."""
     import numpy as np
 
-    from pipelines.live.model import as_evidence
+    from pipelines.live.assess import as_evidence
     from pipelines.live.windows import filter_of
     from terrain.classify.terrain_filter import filter_sessions, novelty_evidence, reported
 
@@ -339,7 +340,7 @@ def _predict_windows(
     """Return the prediction of each window of a run; an unknown one has no terrain, and the table's fallback."""
     import numpy as np
 
-    from pipelines.live.model import class_sets
+    from pipelines.live.assess import class_sets
     from terrain.control.switching import UNKNOWN
 
     best, sets = assessed.probability.argmax(axis=1), class_sets(model, assessed.probability)

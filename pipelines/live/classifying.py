@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from features.stream import WindowFeed
-from pipelines.live.model import Recent, SessionStart, TerrainModel, as_evidence, assess
+from pipelines.live.assess import Recent, SessionStart, as_evidence, assess
+from pipelines.live.model import TerrainModel
 from pipelines.live.windows import feed_of
 from terrain.classify.answers import MANOEUVRE_S
 from terrain.classify.terrain_filter import LiveTerrainFilter

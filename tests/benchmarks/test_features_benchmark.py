@@ -18,7 +18,8 @@ from features.motion import window_motion
 from features.recipes import make_recipe
 from features.windows import cut_windows
 from pipelines.data.datasets import load_runs
-from pipelines.live.model import TerrainModel, assess
+from pipelines.live.assess import assess
+from pipelines.live.model import TerrainModel
 from terrain.classify.answers import learn_answers
 from terrain.classify.limits import learn_novelty, learn_support
 

@@ -8,7 +8,7 @@ from sklearn.ensemble import ExtraTreesClassifier
 
 from features.windows import cut_windows
 from pipelines.learn.classifier import TerrainClassifier
-from pipelines.live.model import assess
+from pipelines.live.assess import assess
 from terrain.classify.trees import fitted_forest
 
 MOST_MS = 2.0  #: Of a live window

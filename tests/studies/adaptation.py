@@ -16,7 +16,8 @@ import numpy as np
 from features.windows import WindowRule, cut_windows, join_windows, layout_of
 from pipelines.data.datasets import load_runs
 from pipelines.learn.classifier import TerrainClassifier
-from pipelines.live.model import TerrainModel, assess
+from pipelines.live.assess import assess
+from pipelines.live.model import TerrainModel
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting

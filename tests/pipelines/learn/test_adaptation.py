@@ -9,7 +9,8 @@ from features.windows import cut_windows, join_windows
 from pipelines.learn.adaptation import judged_adaptation
 from pipelines.learn.classifier import TerrainClassifier
 from pipelines.learn.predict import predict
-from pipelines.live.model import SessionStart, assess, class_sets, with_start
+from pipelines.live.assess import SessionStart, assess, class_sets
+from pipelines.live.model import with_start
 from pipelines.live.observer import Observer
 from pipelines.live.session import Hello, RobotSession, Served
 from terrain.classify.adaptation import START_S, Shift, corrected

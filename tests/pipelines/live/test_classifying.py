@@ -14,8 +14,8 @@ from features.windows import cut_windows
 from pipelines.data.datasets import load_runs
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.training_data import data_of_runs, info_of, with_limits
+from pipelines.live.assess import NOT_LIKE, as_evidence, assess
 from pipelines.live.classifying import AT_MOST, MAX_WAITING, Classifier, WindowOutput, classify_window
-from pipelines.live.model import NOT_LIKE, as_evidence, assess
 from terrain.classify.terrain_filter import check_settings, filter_run, reported
 from terrain.estimation.live import LiveFilter
 from terrain.kinematics.logged_wheels import with_wheel_speeds
