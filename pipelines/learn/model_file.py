@@ -184,7 +184,7 @@ def packed(fitted: Any) -> tuple[bytes, Own]:
         own = _foreign_types(content)
         import_own(own)
         trees_of_arrays(skops_io().loads(content, trusted=[*TRUSTED_TYPES, *own]))
-    except Exception as error:  # skops raises whatever it cannot store
+    except Exception as error:  # skops, and what a user's objects raise when they are written and read back
         raise ModelError(
             f"the recipe cannot be stored ({_words(error)}): a model file holds types of this package and of "
             "scikit-learn, and functions and classes at the top of a module of yours; crossval evaluates all"
@@ -417,4 +417,4 @@ def _foreign_types(content: bytes) -> Own:
 
 
 def _words(error: Exception) -> str:
-    return printable(" ".join(str(error).split())[:200])
+    return printable((" ".join(str(error).split()) or type(error).__name__)[:200])

@@ -197,18 +197,18 @@ def train(
     lower_right = np.concatenate([right for _, _, right in answers], axis=1)
     least_hz = least_rates(tried, held_out.correct[0][rows], lower_right, samples.unit[rows])
     recipe.steps[-1] = (recipe.steps[-1][0], held_out.fitted)
-    info = replace(info_of(data, settings, dataset), least_rate_hz=least_hz)
-    model, missing = with_limits(recipe, info, samples, data.features, data.motion)
-    evaluation = replace(
-        evaluation, dataset=dataset, data_digest=data.digest, notes=(*evaluation.notes, *missing, *notes)
-    )
     refusals = evaluation.refusals
     known = None if refusals is None else (refusals.refused, *refusals.refused_ci)
     info = replace(
-        model.info,
+        info_of(data, settings, dataset),
         commit=code_commit(),
         run_accuracy=run_accuracies(data, evaluation),
+        least_rate_hz=least_hz,
         known_refused=None if known is None or np.isnan(known).any() else known,
+    )
+    model, missing = with_limits(recipe, info, samples, data.features, data.motion)
+    evaluation = replace(
+        evaluation, dataset=dataset, data_digest=data.digest, notes=(*evaluation.notes, *missing, *notes)
     )
     record = TrainingRecord(
         params={name: getattr(evaluation, name) for name in PARAMS}
@@ -217,14 +217,14 @@ def train(
         evaluation=evaluation,
         importance=importance,
         chosen=as_json(getattr(held_out.fitted, "best_", {})),
-        limits=limits_of(info, samples.windows, data.motion, evaluation),
+        limits=limits_of(model.info, samples.windows, data.motion, evaluation),
         versions=versions(),
     )
     drawn = enumerate(figures_of(evaluation.report), start=1)
     pictures = {f"figures/{place}.png": figure_png(figure) for place, figure in drawn}
     with TemporaryDirectory() as place:
         folder = settings.out or Path(place)
-        remember(write_model(folder, model._replace(info=info)))
+        remember(write_model(folder, model))
         card = write_training(folder, settings.name, record)
         try:
             registered = log_training(settings.name, folder, data, pictures)
@@ -237,7 +237,7 @@ def train(
             ) from error
     return TrainResult.of(
         registered,
-        info,
+        model.info,
         record,
         n_windows=len(samples.windows),
         crossval=evaluation,
