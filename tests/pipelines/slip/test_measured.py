@@ -137,11 +137,18 @@ def test_the_stream_has_the_slip_of_the_body_and_what_it_turns_also_where_a_lida
         "wheels": Stream(time_s, rolled, ("speed_right_mps", "speed_left_mps")),
         "lidar": Stream(time_s, twist, ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")),
     }
-    slip = measured_slip(RunLog("a", "husky", streams), robot, window_s=0.5, stride_s=0.1, whole=True).stream
+    over = {"window_s": 0.5, "stride_s": 0.1, "whole": True}
+    slip = measured_slip(RunLog("a", "husky", streams), robot, **over).stream
     known = np.isfinite(slip.values).all(axis=1)
     assert known.mean() > 0.5
     found = slip.columns(BODY_CHANNELS)[known]
     np.testing.assert_allclose(found, np.tile([0.1, 0.1, 0.5], (len(found), 1)), atol=1e-6)
+    streams["wheels"] = Stream(time_s, np.tile([0.6, 0.59], (time_s.size, 1)), streams["wheels"].channels)
+    straight = measured_slip(RunLog("a", "husky", streams), robot, **over).stream
+    assert np.isfinite(straight.columns(BODY_CHANNELS[:2])).mean() > 0.5
+    assert np.isnan(
+        straight.columns(BODY_CHANNELS[2:])
+    ).all()  # wheels that do not turn the robot lose no turning
 
 
 def test_the_command_writes_result_runs_and_pictures(terrain, place, one_ground):

@@ -56,6 +56,11 @@ def test_two_sessions_alone_show_a_range_and_one_nothing_of_another():
     one = session_slips({"mud": (runs, np.full(4, ""))}, rng)["mud"]
     assert (one.interval_of, one.n_sessions) == (IntervalOf.ONE_SESSION, 1)
     assert one.interval[0] <= one.slip_ratio <= one.interval[1]
+    three = session_slips({"mud": (runs[:3], np.array(["a", "b", "c"]))}, rng)["mud"]
+    for normal in (one, three):
+        assert 2 * 1.959964 * normal.std == pytest.approx(np.ptp(normal.interval))
+    apart = session_slips({"mud": (np.array([-0.9, 0.0, 0.9]), np.array(["a", "b", "c"]))}, rng)["mud"]
+    assert apart.interval == (-1.0, 1.0)  # no slip is beyond
     unlabelled = session_slips({"": (runs, np.arange(4).astype(str)), "mud": (runs, session)}, rng)
     assert unlabelled["mud"].interval_of is IntervalOf.RANGE  # runs on no one surface show none of it
     single, none = (session_slips({"mud": (runs[:n], session[:n])}, rng)["mud"] for n in (1, 0))
