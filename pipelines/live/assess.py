@@ -19,8 +19,8 @@ from features.motion import window_motion
 from features.windows import join_windows
 from pipelines.live.model import TerrainModel
 from terrain.classify.adaptation import CERTAIN, corrected, corrections, start_of
-from terrain.classify.answers import best_misfit, over_manoeuvre, rarities
-from terrain.classify.limits import LEVEL, SUPPORTED, conformal_sets, supported_probability
+from terrain.classify.answers import best_misfit, over_manoeuvre
+from terrain.classify.limits import LEVEL, SUPPORTED, conformal_sets, rarities, supported_probability
 from terrain.errors import DataError
 from terrain.records import Array, Windows
 

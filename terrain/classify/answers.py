@@ -35,7 +35,13 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.classify.folds import TOO_FEW, inner_splits, two_classes, units_of
-from terrain.classify.limits import KNOWN_KEPT, MAX_REFERENCE, N_INNER_FOLDS, conformal_threshold
+from terrain.classify.limits import (
+    KNOWN_KEPT,
+    MAX_REFERENCE,
+    N_INNER_FOLDS,
+    conformal_threshold,
+    rarities,
+)
 from terrain.errors import DataError
 from terrain.records import Array
 
@@ -258,24 +264,6 @@ def learn_answers(
     joint = joint_score(reference, novelty[known], score[known])
     threshold = conformal_threshold(joint, unit[known], KNOWN_KEPT, np.inf)
     return _fit(observed, y, unit, classes)._replace(limit=limit, reference=reference, threshold=threshold)
-
-
-def rarities(reference: Array, scores: Array) -> Array:
-    """Return ``-log P`` (n, j) of scores (n, j) by their ranks in ascending references (r, j); 0 where not known.
-
-    Examples
-    --------
-    >>> reference = np.column_stack([np.arange(99.0), np.full(99, np.nan)])
-    >>> rarities(reference, np.array([[99.0, np.nan], [-1.0, 5.0]])).round(2).tolist()
-    [[4.61, 0.0], [0.0, 0.0]]
-    """
-    out = np.zeros(scores.shape)
-    for j in range(scores.shape[1]):
-        n_known = int(np.isfinite(reference[:, j]).sum())  # NaN is last in order
-        n_above = n_known - np.searchsorted(reference[:n_known, j], scores[:, j])
-        rarity = np.log(n_known + 1) - np.log(n_above + 1)
-        out[:, j] = np.where(np.isfinite(scores[:, j]), rarity, 0.0)
-    return out
 
 
 def joint_score(reference: Array, novelty: Array, misfit: Array) -> Array:

@@ -290,13 +290,9 @@ def coverage_of(
 
     draws = Draws.of(unit[tested], terrain, N_BOOTSTRAP, np.random.default_rng(seed))
 
-    def total(windows: Array) -> Array:
-        return np.asarray(draws.weights @ np.bincount(draws.place, windows.sum(axis=0)))
-
     def part(inside: Array) -> PartFigures:
-        n_all, n_inside, n_wrong, n_wrong_inside = map(
-            total, (np.ones(correct.shape), inside, ~correct, inside & ~correct)
-        )
+        of_windows = np.ones(correct.shape), inside, ~correct, inside & ~correct
+        n_all, n_inside, n_wrong, n_wrong_inside = (draws.sums(each.sum(axis=0)) for each in of_windows)
         ratio, interval = draws.ratio(n_inside, n_all)
         accuracy = draws.ratio(n_inside - n_wrong_inside, n_inside)
         of_errors = draws.ratio(n_wrong_inside, n_wrong)

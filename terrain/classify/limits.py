@@ -156,15 +156,27 @@ def largest_margin(margins: Array, n_classes: int) -> Array:
     return found
 
 
+def rarities(reference: Array, scores: Array) -> Array:
+    """Return ``-log P`` (n, j) of scores (n, j) by their ranks in ascending references (r, j); 0 where not known.
+
+    Examples
+    --------
+    >>> reference = np.column_stack([np.arange(99.0), np.full(99, np.nan)])
+    >>> rarities(reference, np.array([[99.0, np.nan], [-1.0, 5.0]])).round(2).tolist()
+    [[4.61, 0.0], [0.0, 0.0]]
+    """
+    out = np.zeros(scores.shape)
+    for j in range(scores.shape[1]):
+        n = int(np.isfinite(reference[:, j]).sum())  # NaN is last in order
+        n_above = n - np.searchsorted(reference[:n, j], scores[:, j])
+        out[:, j] -= np.log((n_above + 1) / (n + 1))
+    return np.where(np.isfinite(scores), out, 0.0)
+
+
 def fisher_scores(reference: Array, terms: Array) -> Array:
-    """Return the score (n,) of terms (n, j) by their ranks in ascending references (r, j)."""
-    n = len(reference)
-    score = np.zeros(len(terms))
-    for j in range(terms.shape[1]):
-        n_above = n - np.searchsorted(reference[:, j], terms[:, j])
-        score -= np.log((n_above + 1) / (n + 1))
-    score[~np.isfinite(terms).all(axis=1)] = np.nan
-    return score
+    """Return the score (n,) of terms (n, j) by their ranks in ascending references (r, j); NaN where one is none."""
+    known = np.isfinite(terms).all(axis=1)
+    return np.where(known, rarities(reference, terms).sum(axis=1), np.nan)
 
 
 def held_out_terms(X: Array, y: Array, groups: Array, *, gap: int = 1, seed: int = 0) -> Array:

@@ -60,6 +60,10 @@ class Draws(NamedTuple):
         """Degrees of freedom of a figure over all units."""
         return freedom_of(self.unit, self.stratum)
 
+    def sums(self, values: Array) -> Array:
+        """Return the sum (1 + draws,) over windows of their values (n,), of all units and of each draw."""
+        return np.asarray(self.weights @ np.bincount(self.place, values))
+
     def interval(self, figures: Array, ends: Interval = (0.0, 1.0)) -> Interval:
         """Return the 95 % interval of a figure of each draw (draws,) without the first; NaN where there is none.
 
@@ -423,9 +427,7 @@ def refusal_figures(
     unit, once = units_of(terrain, groups), np.ones(len(terrain))
     draws = Draws.of(unit, terrain, N_BOOTSTRAP, np.random.default_rng(seed))
     parts = (refused * 1.0, ~refused * 1.0, correct * ~refused * 1.0, once)
-    n_refused, n_accepted, n_right, n_all = (
-        draws.weights @ np.bincount(draws.place, part, draws.weights.shape[1]) for part in parts
-    )
+    n_refused, n_accepted, n_right, n_all = map(draws.sums, parts)
     pairs = (n_refused, n_all), (n_right, n_accepted), (n_right, n_all)
     figures = []
     for numerator, denominator in pairs:

@@ -10,8 +10,8 @@ from terrain.classify.answers import (
     check_answers,
     learn_answers,
     over_manoeuvre,
-    rarities,
 )
+from terrain.classify.limits import rarities
 from terrain.errors import DataError
 
 SLOPES = {"asphalt": 0.50, "gravel": 0.45, "sand": 0.40}
