@@ -28,7 +28,7 @@ from terrain.records import Array, Windows
 
 BANDS_HZ = ((1.0, 10.0), (10.0, 24.0))
 MAX_BAND = 0.52  #: Of the rate: up to there a band may reach. A logger of 20 Hz has the first.
-SHAKEN = {"horizontal": ("accel_x", "accel_y"), "vertical": ("accel_z",), "rocking": ("gyro_x", "gyro_y")}
+AXES = {"horizontal": ("accel_x", "accel_y"), "vertical": ("accel_z",), "rocking": ("gyro_x", "gyro_y")}
 #: Speed, current and squared acceleration or rate under a logarithm: what a sensor resolves.
 MIN_SPEED_MPS, MIN_CURRENT_A, MIN_POWER = 0.05, 0.1, 1e-8
 
@@ -53,71 +53,72 @@ def answers_of(windows: Windows) -> Observed | None:
     places = rows_of_sets(stream, tuple(names), frozenset({"wheels"}))
     speeds = np.ascontiguousarray(windows.values[stream][:, list(places)])  # a window adds up as among many
     mean, ones = speeds.mean(axis=2), np.ones(len(windows))
-    sides = [[i for i, at in enumerate(places) if side in names[at].split("_")] for side in ("left", "right")]
-    sided = all(sides)
+    sides = _sides([names[i] for i in places])
     time_s = (np.arange(speeds.shape[2]) - 0.5 * (speeds.shape[2] - 1)) / windows.rate_hz[stream]
-    if sided:
+    if all(sides):
         left, right = (mean[:, side].mean(axis=1) for side in sides)
         m, d = 0.5 * (left + right), right - left
         turning = [ones, d, m, d * np.abs(d), d * np.abs(m)]
         forward = np.where(m < 0.0, -1.0, 1.0)
         gain_mps2 = forward * (speeds.mean(axis=1) * time_s).sum(axis=1) / (time_s @ time_s)
         both = np.abs(left) + np.abs(right) + MIN_SPEED_MPS
-        turned, outer = np.abs(d) / both, (np.abs(right) - np.abs(left)) / both
+        turn_ratio, outer = np.abs(d) / both, (np.abs(right) - np.abs(left)) / both
     else:
         m, d = np.abs(mean).mean(axis=1), np.ptp(np.abs(mean), axis=1)
         turning = [ones, *mean.T]
         gain_mps2 = (np.abs(speeds).mean(axis=1) * time_s).sum(axis=1) / (time_s @ time_s)
-        outer = turned = d / (np.abs(mean).sum(axis=1) + MIN_SPEED_MPS)
+        outer = turn_ratio = d / (np.abs(mean).sum(axis=1) + MIN_SPEED_MPS)
     fastest = np.log10(np.abs(mean).max(axis=1) + MIN_SPEED_MPS)
-    shaking = [ones, fastest, turned, fastest * turned]
-    found: dict[str, tuple[Array, list[Array]]] = {}
+    shaking = [ones, fastest, turn_ratio, fastest * turn_ratio]
+    answers: dict[str, tuple[Array, list[Array]]] = {}
     for each, channels in windows.channels.items():
         sets = [signal_set_of(each, name) for name in channels]
         values, rate_hz = windows.values[each], windows.rate_hz[each]
         if "gyro_z_radps" in channels and "imu" in sets:
-            found["turn"] = values[:, channels.index("gyro_z_radps")].mean(axis=1), turning
+            answers["turn"] = values[:, channels.index("gyro_z_radps")].mean(axis=1), turning
         bands = [band for band in BANDS_HZ if band[1] <= MAX_BAND * rate_hz]
-        shaken = {
+        axes = {
             kind: rows
-            for kind, quantities in SHAKEN.items()
-            if (rows := [i for i, name in enumerate(channels) if name.startswith(quantities)])
+            for kind, prefixes in AXES.items()
+            if (rows := [i for i, name in enumerate(channels) if name.startswith(prefixes)])
         }
-        if "imu" in sets and bands and shaken:
+        if "imu" in sets and bands and axes:
             taper, of_bands = _spectrum(values.shape[2], rate_hz)
             lines = np.fft.rfft((values - values.mean(axis=2, keepdims=True)) * taper, axis=2)
             power = lines.real**2 + lines.imag**2
             for (low, high), band in zip(bands, of_bands, strict=False):
                 within = power[:, :, band].sum(axis=2)
-                for kind, rows in shaken.items():
+                for kind, rows in axes.items():
                     name = f"shake, {kind}, {low:g} to {high:g} Hz"
-                    found[name] = 0.5 * np.log10(within[:, rows].sum(axis=1) + MIN_POWER), shaking
+                    answers[name] = 0.5 * np.log10(within[:, rows].sum(axis=1) + MIN_POWER), shaking
         currents = [i for i, of in enumerate(sets) if of == "currents"]
         if currents:
-            drawn = np.ascontiguousarray(np.abs(values[:, currents]))
-            load = drawn.mean(axis=2)
-            found["current"] = load.sum(axis=1), [ones, np.abs(m), np.abs(d), gain_mps2, turned]
-            ripple = np.log10(np.sqrt(drawn.var(axis=2).sum(axis=1)) + MIN_CURRENT_A)
-            found["current, ripple"] = ripple, shaking
-            halves = [
-                [k for k, i in enumerate(currents) if side in channels[i].split("_")]
-                for side in ("left", "right")
-            ]
-            if sided and all(halves):
-                over = load[:, halves[1]].sum(axis=1) - load[:, halves[0]].sum(axis=1)
-                found["current, sides"] = over, [ones, d, d * forward, m]
+            magnitude = np.ascontiguousarray(np.abs(values[:, currents]))
+            load = magnitude.mean(axis=2)
+            answers["current"] = load.sum(axis=1), [ones, np.abs(m), np.abs(d), gain_mps2, turn_ratio]
+            ripple = np.log10(np.sqrt(magnitude.var(axis=2).sum(axis=1)) + MIN_CURRENT_A)
+            answers["current, ripple"] = ripple, shaking
+            motors = _sides([channels[i] for i in currents])
+            if all(sides) and all(motors):
+                left, right = (load[:, side].sum(axis=1) for side in motors)
+                answers["current, sides"] = right - left, [ones, d, d * forward, m]
         for i in [i for i, of in enumerate(sets) if of == "slip"]:
             known = np.isfinite(values[:, i])
             share, total = known.mean(axis=1), np.where(known, values[:, i], 0.0).mean(axis=1)
             undefined, enough = np.full(len(windows), np.nan), share >= MIN_DEFINED_FRACTION
             slip = np.divide(total, share, out=undefined, where=enough)
-            found[f"slip, {channels[i].split('_')[1]}"] = slip, [ones, fastest, turned, outer]
-    if not found:
+            answers[f"slip, {channels[i].split('_')[1]}"] = slip, [ones, fastest, turn_ratio, outer]
+    if not answers:
         return None
-    driving = np.zeros((len(windows), len(found), max(len(of) for _, of in found.values())))
-    for number, (_, of) in enumerate(found.values()):
+    driving = np.zeros((len(windows), len(answers), max(len(of) for _, of in answers.values())))
+    for number, (_, of) in enumerate(answers.values()):
         driving[:, number, : len(of)] = np.column_stack(of)
-    return Observed(tuple(found), np.column_stack([response for response, _ in found.values()]), driving)
+    return Observed(tuple(answers), np.column_stack([response for response, _ in answers.values()]), driving)
+
+
+def _sides(names: list[str]) -> list[list[int]]:
+    """Return the places of the channels of the left, and of the right side."""
+    return [[i for i, name in enumerate(names) if side in name.split("_")] for side in ("left", "right")]
 
 
 @lru_cache(maxsize=64)
