@@ -79,15 +79,11 @@ def assess(model: TerrainModel, windows: Windows, recent: Recent | None = None) 
     unknown, misfits = np.zeros(len(windows), dtype=bool), np.zeros((len(windows), 0, 0))
     if model.novelty is not None:
         unknown = ~(novelty <= model.novelty.threshold)
-    answering: dict[int, str] = {}
+    reason = np.full(len(windows), "", dtype=object)
     if (laws := model.answers) is not None:
-        misfits, end_s, run = (
-            laws.misfits(answers_of(windows)),
-            windows.start_s + windows.length_s,
-            windows.run_id,
-        )
+        misfits, end_s = laws.misfits(answers_of(windows)), windows.start_s + windows.length_s
         earlier, earlier_s = recent or (misfits[:0], end_s[:0])
-        run = np.concatenate([np.repeat(run[:1], len(earlier_s)), run])
+        run = np.concatenate([np.repeat(windows.run_id[:1], len(earlier_s)), windows.run_id])
         all_misfits, all_s = np.concatenate([earlier, misfits]), np.concatenate([earlier_s, end_s])
         over = over_manoeuvre(all_misfits, all_s, run)[len(earlier_s) :]
         answers = best_misfit(over)
@@ -95,13 +91,9 @@ def assess(model: TerrainModel, windows: Windows, recent: Recent | None = None) 
         unknown = (np.linalg.norm(rare, axis=1) > laws.threshold) | (
             np.isnan(novelty) & (model.novelty is not None)
         )
-        answering = {
-            row: laws.reason(over[row], str(model.recipe.classes_[probability[row].argmax()]))
-            for row in np.flatnonzero(unknown & (rare[:, 1] > 0.0) & (rare[:, 1] >= rare[:, 0])).tolist()
-        }
-    reason = np.array(
-        [answering.get(row, NOT_LIKE if each else "") for row, each in enumerate(unknown)], dtype=object
-    )
+        for row in np.flatnonzero(unknown & (rare[:, 1] > 0.0) & (rare[:, 1] >= rare[:, 0])):
+            reason[row] = laws.reason(over[row], str(model.recipe.classes_[probability[row].argmax()]))
+    reason[unknown & (reason == "")] = NOT_LIKE
     if model.session_shift is not None:
         doubtful = ~(probability.max(axis=1) >= CERTAIN)
         reason[doubtful & ~unknown], unknown = NOT_CERTAIN, unknown | doubtful
