@@ -314,22 +314,17 @@ def _filtered(parts: Sequence[Windows], assessed: Sequence[Assessed], info: Mode
     """Return the column of the class that is reported over time in each window of runs; -1 for unknown."""
     import numpy as np
 
-    from pipelines.live.assess import as_evidence
+    from pipelines.live.assess import Assessed, as_evidence
     from pipelines.live.windows import filter_of
     from terrain.classify.terrain_filter import filter_sessions, novelty_evidence, reported
 
     settings = filter_of(info)
     if settings is None or not parts:
         return [np.where(each.unknown, -1, each.probability.argmax(axis=1)) for each in assessed]
-    probability, end_s, groups, evidence = (
-        np.concatenate(of_parts)
-        for of_parts in (
-            [as_evidence(each.probability, each.reason) for each in assessed],
-            [part.start_s + part.length_s for part in parts],
-            [part.groups for part in parts],
-            [novelty_evidence(each.novelty, each.unknown) for each in assessed],
-        )
-    )
+    found, groups = Assessed.join(assessed), np.concatenate([part.groups for part in parts])
+    probability = as_evidence(found.probability, found.reason)
+    evidence = novelty_evidence(found.novelty, found.unknown)
+    end_s = np.concatenate([part.start_s + part.length_s for part in parts])
     belief = filter_sessions(probability, end_s, groups, info.window_s, settings, evidence)
     return np.split(reported(belief), np.cumsum([len(part) for part in parts])[:-1])
 

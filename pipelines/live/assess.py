@@ -9,6 +9,7 @@ terrain like this (:mod:`terrain.classify.limits`).  Of windows of known terrain
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -37,6 +38,11 @@ class Assessed(NamedTuple):
     answers: Array
     reason: Array  #: (n,) why a window is unknown, in words; empty where it is not
     misfits: Array  #: (n, k, q) of each window alone, as :meth:`Answers.misfits`; (n, 0, 0) without laws
+
+    @classmethod
+    def join(cls, parts: Sequence[Assessed]) -> Assessed:
+        """Return the outputs for windows of several parts, one after the other."""
+        return cls(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 class Recent(NamedTuple):
@@ -186,7 +192,7 @@ class SessionStart:
                     Recent(parts[0].misfits, windows.start_s[start] + windows.length_s) if parts else None
                 )
                 parts.append(assess(self.take(each), each, before))
-        return Assessed(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+        return Assessed.join(parts)
 
     def take(self, windows: Windows) -> TerrainModel:
         """Return the model for windows that follow those taken before, all within or all after the start."""
