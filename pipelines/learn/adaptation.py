@@ -14,6 +14,7 @@ from terrain.classify.adaptation import (
     START_S,
     Adaptation,
     adapt,
+    averaged,
     corrected,
     corrections,
     learn_adaptation,
@@ -36,11 +37,6 @@ def channels_of(windows: Windows, signal_set: str) -> tuple[tuple[str, str], ...
     return tuple(each for each in every if signal_set_of(*each) == signal_set)
 
 
-def levels_of(windows: Windows) -> tuple[tuple[str, str], ...]:
-    """Return stream and channel of each current, and of each channel of an IMU."""
-    return channels_of(windows, "currents") + channels_of(windows, "imu")
-
-
 def judged_adaptation(
     windows: Windows, features: Array, extract: Callable[[Windows], Array], gap: int, seed: int
 ) -> Adaptation:
@@ -60,7 +56,8 @@ def judged_adaptation(
     DataError
         as :func:`learn_adaptation`.
     """
-    channels = levels_of(windows), channels_of(windows, "wheels")
+    currents, imu, wheels = (channels_of(windows, each) for each in ("currents", "imu", "wheels"))
+    channels = currents + imu, wheels
     learned = learn_adaptation(windows, *channels)
     y, groups = windows.terrain.astype(str), windows.groups
     unit, kind = units_of(y, groups), "session" if has_sessions(y, groups) else "run"
@@ -94,10 +91,9 @@ def judged_adaptation(
                     continue
                 shifted = adapt(law, windows[own[start]])
                 values, weights = corrections(shifted)
-                each = probability(extract(corrected(shifted, windows[rest], values)))
-                averaged = np.einsum("ink,ik->nk", each.reshape(len(values), len(rest), -1), weights)
+                by_each = probability(extract(corrected(shifted, windows[rest], values)))
                 truth = np.searchsorted(judge.classes_, y[rest])
-                pair = probability(features[rest]), averaged / averaged.sum(axis=1, keepdims=True)
+                pair = probability(features[rest]), averaged(by_each, weights)
                 losses.append(
                     [
                         -np.log(np.maximum(of[np.arange(len(rest)), truth], LEAST_PROBABILITY)).mean()

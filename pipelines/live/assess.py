@@ -19,7 +19,7 @@ from features.answers import answers_of
 from features.motion import window_motion
 from features.windows import join_windows
 from pipelines.live.model import TerrainModel
-from terrain.classify.adaptation import CERTAIN, corrected, corrections, start_of
+from terrain.classify.adaptation import CERTAIN, averaged, corrected, corrections, start_of
 from terrain.classify.answers import best_misfit, over_manoeuvre
 from terrain.classify.limits import LEVEL, SUPPORTED, conformal_sets, rarities, supported_probability
 from terrain.errors import DataError
@@ -128,8 +128,7 @@ def _outputs(model: TerrainModel, windows: Windows) -> tuple[Array, Array, Windo
         recipe.predict_proba(windows) if from_features is None else from_features(windows, features)
     )
     if of_terrain is not None:
-        probability = np.einsum("ink,ik->nk", probability.reshape(-1, n, probability.shape[1]), of_terrain)
-        probability /= probability.sum(axis=1, keepdims=True)
+        probability = averaged(probability, of_terrain)
         row = (of_terrain > 0.0).argmax(axis=0)[probability.argmax(axis=1)] * n + np.arange(n)
         windows, novelty = windows[row], None if novelty is None else novelty[row]
     return probability, np.full(n, np.nan) if novelty is None else novelty, windows

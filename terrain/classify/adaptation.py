@@ -296,6 +296,13 @@ def corrections(adaptation: Adaptation) -> tuple[Array, Array]:
     return np.concatenate(values), np.concatenate(weights)
 
 
+def averaged(probability: Array, weights: Array) -> Array:
+    """Return probabilities (n, k) by those (p n, k) of windows :func:`corrected` by each theta, and weights (p, k)."""
+    p, k = weights.shape
+    mean = np.einsum("ink,ik->nk", probability.reshape(p, len(probability) // p, k), weights)
+    return np.asarray(mean / mean.sum(axis=1, keepdims=True))
+
+
 def corrected(adaptation: Adaptation, windows: Windows, theta: Array) -> Windows:
     """Return windows whose channels are as in training, if theta is what shifted: of each theta (p, d) all n.
 
