@@ -19,6 +19,7 @@ from terrain.records import Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import Drive, learning_runs
 from terrain.slip_learning.curve import learn_curve
+from terrain.slip_learning.learn import terrain_runs
 
 ROBOT = load_robot("agrimaro")
 DRIVES = (
@@ -141,6 +142,11 @@ def test_runs_without_the_required_data_are_refused_and_left_out_on_request(runs
     assert result.n_runs == 1
     (sentence,) = result.skipped
     assert "current_1_a" in sentence
+
+
+def test_the_bins_of_a_run_are_of_its_session(runs):
+    (found,) = terrain_runs(replace(runs[0], session="monday"), ROBOT)
+    assert found.bins.session == "monday"
 
 
 def test_paths_that_cannot_be_written_are_refused(learned, tmp_path):

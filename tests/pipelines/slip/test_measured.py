@@ -97,16 +97,22 @@ def test_changes_are_found_and_judged(one_ground, two_grounds):
     assert result.found_ratio == 1.0
     assert -0.25 <= result.delay_median_s < 2.0
     assert all(-0.25 <= run.delay_s <= MAX_DELAY_S for run in result.runs)
-    # currents that change 3.5 s before the slip: the alarm is early, which is false, and the change is not found
+    # currents that change long before the slip, or after it: the change is not found, and an early alarm is false
     rng, time_s = np.random.default_rng(2), np.arange(0.0, LENGTH_S, 0.031)
-    slip, current = (
-        np.where(time_s < at_s, both["cork"], both["moss"]) for both, at_s in ((SLIP, 6.0), (CURRENT, 2.5))
-    )
-    early = find_changes([omni_run(rng, "early", "", 0.5, slip, current, "border", (0.05, 0.5))], one_ground)
-    assert (early.n_steps, early.found_ratio) == (1, 0.0)
-    assert early.n_early >= 1
+    for slip_s, current_s in ((6.0, 2.5), (2.5, 6.5)):
+        slip, current = (
+            np.where(time_s < at_s, both["cork"], both["moss"])
+            for both, at_s in ((SLIP, slip_s), (CURRENT, current_s))
+        )
+        run = omni_run(rng, "apart", "", 0.5, slip, current, "border", (0.05, 0.5))
+        apart = find_changes([run], one_ground)
+        assert (apart.n_steps, apart.found_ratio) == (1, 0.0)
+        assert apart.runs[0].changes
+        assert (apart.n_early >= 1) == (current_s < slip_s)
     low, high = result.false_alarm_interval
     assert low <= result.false_alarm_ratio <= high
+    sessions = [replace(run, session=f"session {i % 2}") for i, run in enumerate(one_ground)]
+    assert find_changes([run], sessions).false_alarm_interval[1] > 2 * high  # of two units, not of 20
     quiet = find_changes(one_ground[:5], one_ground[5:])
     assert (quiet.n_steps, quiet.n_without_step, np.isnan(quiet.found_ratio)) == (0, 5, True)
     with pytest.raises(DataError, match="is watched and calibrated on"):

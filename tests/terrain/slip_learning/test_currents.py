@@ -73,9 +73,10 @@ def test_the_interval_of_an_error_is_over_sessions_where_there_are_several():
     zero, terrain = np.zeros(120), np.full(120, "mud")
     predicted = PredictedSlip(*np.stack([error, zero, error - 1.0, error + 1.0]))
 
-    def width(session):
+    def interval(session):
         cases = SimpleNamespace(slip=zero, run_id=run, session=session, terrain=terrain)
-        low, high = currents._figures("runs", cases, predicted, np.random.default_rng(0)).rms_interval
-        return high - low
+        return currents._figures("runs", cases, predicted, np.random.default_rng(0)).rms_interval
 
-    assert width(run // 10) > 3.0 * width(np.zeros(120))
+    low, high = interval(run // 10)
+    assert high - low > 3.0 * np.ptp(interval(np.zeros(120)))
+    assert (low, high > 0.05) == (0.0, True)  # by Student's t of three, which none of them bounds
