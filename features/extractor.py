@@ -378,10 +378,10 @@ class PlainExtractor(FeatureExtractor):
 
     Examples
     --------
-    >>> windows = Windows({"imu": np.array([[[1.0, 3.0]]])}, {"imu": ("accel_z_mps2",)}, {"imu": 1.0}, 2.0,
+    >>> windows = Windows({"imu": np.array([[[1.0, 5.0]]])}, {"imu": ("accel_z_mps2",)}, {"imu": 1.0}, 2.0,
     ...                   np.zeros(1), np.array(["a"]), np.array(["grass"]))
     >>> PlainExtractor().fit_transform(windows)
-    array([[2., 1.]])
+    array([[3., 2.]])
     """
 
     def named(self, windows: Windows) -> tuple[list[Feature], Array]:

@@ -16,6 +16,7 @@ from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.training_data import data_of_runs, info_of, with_limits
 from pipelines.live.windows import filter_of, filtered
 from terrain.classify.grouped import OwnClassifier
+from terrain.classify.svm import GroupedSVC
 from terrain.classify.terrain_filter import filter_sessions, reported
 from terrain.errors import ConfigError, DataError, ModelError
 
@@ -47,6 +48,14 @@ def test_an_estimator_of_scikit_learn_is_fitted_to_labels_of_ones_own_and_stored
     again = TerrainClassifier.load(model.save(tmp_path / "neighbours"))
     assert np.array_equal(again.predict_proba(windows), model.predict_proba(windows))
     assert again.classes_.tolist() == ["hard", "soft"]
+
+
+def test_a_recipe_passes_session_and_run_of_each_window_on(windows, monkeypatch):
+    passed = []
+    monkeypatch.setattr(GroupedSVC, "fit", lambda self, X, y, groups: passed.append(groups))
+    session = np.where(np.arange(len(windows)) % 2, "monday", "tuesday")
+    make_recipe("svm").fit(replace(windows, session=session), windows.terrain)
+    np.testing.assert_array_equal(passed, [np.stack([session, windows.run_id], axis=1)])
 
 
 def local():
