@@ -37,8 +37,8 @@ class Settings(BaseSettings):
     data: Path = setting(..., "Folder of labelled runs of one session.")
     other: Path | None = setting(None, "Folder of labelled runs of the same robot in another session.")
     recipe: str = setting("svm", "What is trained.")
-    sessions: int = setting(8, "Changes that are drawn for each half of the runs.", ge=1)
     seed: int = setting(0, "Deals runs, and draws changes and references.", ge=0)
+    sessions: int = setting(8, "Changes that are drawn for each half of the runs.", ge=1)
 
 
 class Row(NamedTuple):
@@ -72,16 +72,16 @@ def run(settings: Settings, progress: Progress = silent) -> AdaptationStudy:
         model = TerrainClassifier(settings.recipe).fit(windows[train]).model_
         for number in range(settings.sessions):
             kind = ("changed", "changed, each terrain further")[number % 2]
-            session = _changed(windows[test], model.adaptation, number % 2 == 1, rng)
-            for name, judged in _references(model, session, rng):
-                found.setdefault((kind, name), []).append(judged)
+            session = _shift_session(windows[test], model.adaptation, number % 2 == 1, rng)
+            for name, outcomes in _references(model, session, rng):
+                found.setdefault((kind, name), []).append(outcomes)
     model = TerrainClassifier(settings.recipe).fit(windows).model_
     if settings.other is not None:
         other = load_runs(settings.other, repair=True)
         session = cut_windows(other, rule, layout=layout, skip_short=True).windows
         for _ in range(settings.sessions):
-            for name, judged in _references(model, session, rng):
-                found.setdefault((settings.other.name, name), []).append(judged)
+            for name, outcomes in _references(model, session, rng):
+                found.setdefault((settings.other.name, name), []).append(outcomes)
     rows = [(key, np.concatenate(each)) for key, each in found.items()]
     assert model.adaptation is not None
     return AdaptationStudy(
@@ -90,7 +90,9 @@ def run(settings: Settings, progress: Progress = silent) -> AdaptationStudy:
     )
 
 
-def _changed(windows: Windows, adaptation: Adaptation | None, own: bool, rng: np.random.Generator) -> Windows:
+def _shift_session(
+    windows: Windows, adaptation: Adaptation | None, own: bool, rng: np.random.Generator
+) -> Windows:
     """Return windows of a session whose shift is drawn; of each terrain a further one where it has its own."""
     assert adaptation is not None
     of_all = rng.uniform(*GAINS), OFFSET_STD * rng.standard_normal()
@@ -117,8 +119,8 @@ def _references(
     """Yield, by the reference, what the model gives for windows of other runs."""
     terrains = np.unique(session.terrain.astype(str)).tolist()
     every = np.ones(len(session), dtype=bool)
-    yield "none: as trained", _judged(model, session, every)
-    yield "none: spread of sessions", _judged(model.at_start(), session, every)
+    yield "none: as trained", _outcomes(model, session, every)
+    yield "none: spread of sessions", _outcomes(model.at_start(), session, every)
     for terrain in terrains:
         used = np.zeros(len(session), dtype=bool)
         for name in rng.permutation(np.unique(session.run_id[session.terrain == terrain].astype(str))):
@@ -126,10 +128,10 @@ def _references(
                 used |= session.run_id.astype(str) == name
         for named in (terrain, ""):
             adapted = model.adapt(session[used], named)
-            yield named or "not named", _judged(adapted, session, ~used)
+            yield named or "not named", _outcomes(adapted, session, ~used)
 
 
-def _judged(model: TerrainModel, session: Windows, rows: Array) -> Array:
+def _outcomes(model: TerrainModel, session: Windows, rows: Array) -> Array:
     """Return of windows whether they are right, wrong and not unknown, unknown, and their probability (n, 4)."""
     kept = np.flatnonzero(rows)
     kept = kept[:: max(len(kept) // MAX_WINDOWS, 1)]
