@@ -1,7 +1,13 @@
 import numpy as np
 import pytest
 
-from terrain.bootstrap import bootstrap_counts, bootstrap_rows, percentile_interval, stratified_counts
+from terrain.bootstrap import (
+    bootstrap_counts,
+    bootstrap_rows,
+    percentile_interval,
+    shared_strata,
+    stratified_counts,
+)
 
 
 def test_a_sample_has_as_many_runs_as_there_are_and_draws_each_alike():
@@ -25,6 +31,11 @@ def test_the_interval_of_a_mean_is_that_of_its_standard_error():
 
 def test_a_draw_without_a_value_is_skipped():
     assert percentile_interval(np.array([np.nan, 0.0, 1.0]), 0.5) == (0.25, 0.75)
+
+
+def test_classes_that_units_link_through_others_are_one_stratum():
+    unit, terrain = np.array(list("aabbccd")), np.array(list("vwwxxyz"))
+    assert shared_strata(unit, terrain).tolist() == ["v, w, x, y"] * 6 + ["z"]
 
 
 @pytest.mark.parametrize("n_units", [(3,), (2, 2), (2, 2, 2), (4, 3), (12,)])

@@ -9,6 +9,7 @@ from terrain.classify import adaptation
 from terrain.classify.adaptation import (
     COMMON,
     GAIN_STD,
+    MIN_GAIN,
     START_S,
     adapt,
     check_adaptation,
@@ -77,6 +78,8 @@ def test_what_is_hidden_in_a_drive_on_a_known_ground_is_found_within_its_error(
     other = 1 - c  # of which half of the variance between sessions is known
     assert found.shift.mean[other] == pytest.approx(COMMON * found.shift.mean[c])
     assert np.linalg.eigvalsh(found.shift.cov[other] - found.shift.cov[c]).min() > 0.0
+    prior = np.diag(learned.prior_std**2)
+    assert found.shift.cov[other] == pytest.approx(prior - COMMON**2 * (prior - found.shift.cov[c]))
     assert f"times those of training, from 20 s on {terrain}" in found.found
 
 
@@ -88,6 +91,10 @@ def test_a_ground_without_a_name_is_found_where_no_gain_makes_one_of_the_other(l
     named = adapt(learned, drives(["mud"], 8, 1, gain=1.3), "mud")
     assert heavy.shift.cov[1][0, 0] > named.shift.cov[1][0, 0]
     assert "on a ground that was not named" in heavy.found
+    own = (1.0 - COMMON) * np.diag(learned.prior_std**2)  # what the ground itself became is not known
+    assert np.linalg.eigvalsh(heavy.shift.cov[0] - own).min() > 0.0
+    repeated = adapt(learned, drives(["mud"], 8, 1, gain=1.3)[np.tile(np.arange(10), 4)]).shift
+    assert repeated.mean == pytest.approx(heavy.shift.mean, rel=1e-6)  # a run is one observation
 
 
 def test_nothing_shifted_changes_nothing_and_a_shift_is_corrected(learned):
@@ -104,6 +111,8 @@ def test_nothing_shifted_changes_nothing_and_a_shift_is_corrected(learned):
     less = corrected(learned, shifted, np.array([0.0, 9.0 / learned.scale[0], 0.0]))
     assert (less.values["wheels"][:, 2:] == 0.0).all()  # a magnitude stays one
     signed = replace(shifted, values={**shifted.values, "wheels": -shifted.values["wheels"]})
+    least = [corrected(learned, windows, np.array([a, 0.0, a])).values for a in (-0.99, MIN_GAIN - 1.0)]
+    assert all(np.array_equal(least[0][name], least[1][name]) for name in windows.values)
     mirrored = corrected(learned, signed, np.array([0.25, 0.1 / learned.scale[0], 0.4]))
     assert np.allclose(mirrored.values["wheels"][:, 2:], -back.values["wheels"][:, 2:])
 
@@ -133,7 +142,14 @@ def test_the_spread_of_sessions_is_learned_where_a_terrain_has_several():
 
     same, apart = learn([1.0] * 4), learn([0.6, 0.9, 1.2, 1.5])
     assert same.n_sessions == apart.n_sessions == 8
-    assert same.prior_std[0] < 0.8 * GAIN_STD < GAIN_STD < apart.prior_std[0]
+    assert same.prior_std[0] < 0.8 * GAIN_STD < 1.5 * GAIN_STD < apart.prior_std[0]
+
+
+def test_the_scatter_of_runs_is_that_of_runs_that_are_compared_with_others(learned):
+    of_run = 0.03 * np.sqrt(
+        np.mean([np.square(learned.level[learned.of == c].mean(axis=0)) for c in (0, 1)], 0)
+    )
+    assert learned.run_std[:2].sum() > of_run[:2].sum()
 
 
 def test_the_start_of_a_session_goes_over_its_runs():

@@ -171,6 +171,8 @@ def test_sets_over_few_sessions_hold_what_so_few_can_show():
         scores, runs = draw_scores(rng, 20)
         coverage.append(np.mean([(scores[runs == r] <= threshold).mean() for r in range(20)]))
     assert 5 / 6 <= np.mean(coverage) <= 0.97
+    scores, runs = np.r_[np.full(18, 0.1), 0.5, 0.6], np.repeat([0, 1], 10)
+    assert conformal_threshold(scores, runs, 0.9) == 0.6  # at 0.1 the mean is 0.9, its bound is not
 
 
 def test_runs_weigh_alike_however_long_and_one_of_them_holds_all_classes():

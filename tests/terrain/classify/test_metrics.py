@@ -23,6 +23,7 @@ from terrain.classify.metrics import (
     held_out_figures,
     last_class,
     paired_accuracy,
+    refusal_figures,
     sequence_figures,
     track_of,
     vote,
@@ -351,3 +352,14 @@ def test_a_session_on_several_terrains_is_one_unit():
     a, b = (Outcome(session, terrain, each[None], np.full((1, 120), 0.9)) for each in (right, ~right))
     found = compare_outcomes(a, b, np.random.default_rng(0))
     assert (found.accuracy.n_units, found.by_class["ice"].n_units) == (3, 3)
+
+
+def test_a_run_of_few_windows_is_not_the_worst_one():
+    run = np.repeat(["a", "b", "c", "d", "e"], [10, 10, 10, 10, metrics.MIN_UNIT_WINDOWS - 1])
+    refused, terrain = (
+        (run == "e") | (np.arange(len(run)) == 3),
+        np.where(np.isin(run, ["a", "b"]), "ice", "mud"),
+    )
+    assert refusal_figures(refused, ~refused, terrain, run, 0).worst_unit == 0.1
+    few = refusal_figures(refused[-4:], ~refused[-4:], terrain[-4:], run[-4:], 0)
+    assert np.isnan(few.worst_unit)

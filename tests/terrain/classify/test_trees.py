@@ -43,6 +43,9 @@ def test_held_out_probabilities_are_of_whole_runs_and_calibrated(boosted):
     held_out = trees.inner_probability_[np.arange(len(y)), place]
     assert np.isfinite(held_out).all()
     np.testing.assert_allclose(trees.inner_probability_.sum(axis=1), 1.0, atol=1e-12)
+    if not boosted:
+        logs = trees._logs(trees.preparation_, trees.forest_, X)
+        assert logs.min() == pytest.approx(np.log(0.5 / 60))  # of a class that no tree gives
     assert held_out.mean() < trees.predict_proba(X)[np.arange(len(y)), place].mean() - 0.05
     new, truth, _ = draw(n_runs=60, seed=9)
     found = trees.predict_proba(new)
