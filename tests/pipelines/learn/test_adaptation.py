@@ -111,6 +111,8 @@ def test_the_start_of_a_session_adapts_alike_live_in_a_log_and_window_by_window(
     assert [one.probability for one in outputs] == pytest.approx(together.probability.max(axis=1))
     assert [one.terrain or "unknown" for one in outputs] == [row.terrain for row in logged.windows]
     assert observer.source.adapted == after.adaptation.found
+    observer.source.restart()  # the session goes on
+    assert observer.source._part.session.model.adaptation.found == after.adaptation.found
 
 
 def test_a_start_of_too_few_windows_leaves_what_a_session_begins_with(fitted, drive):

@@ -19,10 +19,11 @@ from pipelines.learn import evaluate as evaluation
 from pipelines.learn.comparison import compare_models
 from pipelines.learn.crossval import EvaluationSettings, crossval
 from pipelines.learn.evaluate import evaluate
+from pipelines.learn.model_file import read_files
 from pipelines.report.numbers import format_counts
 from pipelines.report.results import as_json
 from terrain.classify.folds import Fold
-from terrain.classify.held_out import Examples, FoldResult, HeldOut
+from terrain.classify.held_out import Examples, FoldResult, HeldOut, Looks, refused_rows
 from terrain.classify.limits import SupportLevel
 from terrain.classify.metrics import Verdict
 from terrain.errors import DataError
@@ -154,6 +155,21 @@ def test_the_baseline_beside_a_recipe_is_what_it_is_alone_on_the_same_folds(with
     assert found.plain_accuracy == alone.accuracy
     assert any("recipe plain" in str(name) for name, *_ in found.report.parts[1].rows)
     assert 0.0 < tracked[1].crossval.plain_accuracy < 1.0  # of a training, too
+
+
+def test_refusals_are_by_what_each_fold_makes_of_windows_that_it_holds_out(with_extras, settings, tracked):
+    runs, found = with_extras
+    asked = settings(extras=True)
+    samples = samples_of(runs, asked.rule, asked.signal_sets, **asked.reading)
+    features, refused = feature_matrix(make_recipe("svm"), samples.windows), np.zeros(len(samples.terrain))
+    looks = Looks(features, samples.observed, samples.windows.start_s + samples.windows.length_s)
+    dealt = looks, samples.terrain, samples.group, samples.gap, asked.seed
+    for fold in folds_of(samples, "grouped", 1, asked.seed):
+        refused[fold.test] = refused_rows(*dealt, fold.train, fold.test)
+    assert found.refusals.refused == refused.mean() > 0.0
+    assert found.refusals.worst_unit == max(refused[samples.run_id == run.run_id].mean() for run in runs)
+    of_training = tracked[1].crossval.refusals  # kept in its model
+    assert read_files(tracked[0] / "model")[0].known_refused == (of_training.refused, *of_training.refused_ci)
 
 
 def test_extras_do_without_what_the_data_lack(drive, settings):
