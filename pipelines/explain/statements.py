@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 
 from pipelines.report.numbers import enumerated
 from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, Slope, off_by, rms_of, slopes_of
-from terrain.discrepancy.held_out import Gain, Reference
+from terrain.discrepancy.held_out import Gain
+from terrain.discrepancy.learner import Reference
 from terrain.discrepancy.robot_terms import UNITS, in_robot_terms, quantity, values_with_intervals
 from terrain.discrepancy.runs import TerrainMatch, measured_channels
 from terrain.discrepancy.verdict import Diagnosis, RuledOut, Varying

@@ -18,14 +18,13 @@ from terrain.discrepancy.held_out import (
     HOLD_OUT_FROM,
     Comparison,
     Gain,
-    Reference,
-    black_box_reference,
     filter_gain,
     fit_to_judge,
     gain_of_signals,
     repair_held_out,
     split_runs,
 )
+from terrain.discrepancy.learner import Reference, black_box_reference
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.runs import (
     LowPass,

@@ -10,7 +10,8 @@ from pipelines.report.numbers import NOT_KNOWN
 from pipelines.report.terminal import terminal_text
 from terrain.discrepancy import verdict
 from terrain.discrepancy.diagnosed_runs import HeldOutGain
-from terrain.discrepancy.held_out import Change, ChannelGain, ChannelReference, Comparison, Gain, Reference
+from terrain.discrepancy.held_out import Change, ChannelGain, Comparison, Gain
+from terrain.discrepancy.learner import ChannelReference, Reference
 from terrain.discrepancy.runs import measured_channels
 from terrain.discrepancy.verdict import Clock, Excluded
 from terrain.robots import load_robot
