@@ -152,6 +152,9 @@ class Parameter(NamedTuple):
     low: float  #: bounds of the search
     high: float
     step: float
+    #: range of the whole value that a builder would believe; a value whose interval lies beyond it is never named
+    plausible: tuple[float, float] = (-math.inf, math.inf)
+    plausible_source: str = ""
     homes: tuple[Home, ...] = ()  #: where the description has it; all of them change together
     inverse: Inverse | None = None
     one_sided: bool = False  #: sensitivities towards the positive side only: a backlash is not negative

@@ -129,7 +129,8 @@ def test_names_are_unique_and_entries_are_whole():
         assert (effect.stage is None) == (SWERVE not in effect.drives)
         robot = ROBOTS["swerve" if SWERVE in effect.drives else effect.drives[0]]
         for p in effect.parameters:
-            assert p.low <= 0.0 < p.high
+            assert p.low <= p.plausible[0] <= 0.0 < p.plausible[1] <= p.high
+            assert p.plausible_source
             assert 0.0 < p.step < 0.1 * p.high
             assert p.unit in ("ratio", "rad", "s", "s2", "s2pm", "s2pm2", "m", "a", "radps", "mps2", "nspm")
             assert p.homes or effect.stage is not Stage.DESCRIPTION
@@ -147,8 +148,9 @@ entry = """
 gear_wear:
   source: a test
   parameters:
-    gear_wear_ratio: {low: -0.1, high: 0.1, step: 0.001, one_sided: true, scatter_rank: 10, as_percent: true,
-      is_error: true, deprecated: [worn_ratio], homes: {motors.efficiency_ratio: x (1 + e)}}
+    gear_wear_ratio: {low: -0.1, high: 0.1, plausible: [0, 0.1], plausible_source: z, step: 0.001,
+      one_sided: true, scatter_rank: 10, as_percent: true, is_error: true, deprecated: [worn_ratio],
+      homes: {motors.efficiency_ratio: x (1 + e)}}
   drives: [swerve]
   channels: [current_a]
   needs: z
