@@ -17,11 +17,19 @@ import numpy as np
 from terrain.discrepancy import constancy, verdict
 from terrain.discrepancy.clocks import latencies_of, shifts_of
 from terrain.discrepancy.evidence import EXCITED_RATIO, Z_EFFECT, Evidence, move_point, partial_information
-from terrain.discrepancy.health import Excluded, clocks_of, faults_of, repaired, unfit_runs
+from terrain.discrepancy.health import clocks_of, faults_of, repaired, unfit_runs
 from terrain.discrepancy.next_drive import MOST, next_drive
 from terrain.discrepancy.probes import TILT_INPUTS, ProbeResult, probe_residuals
 from terrain.discrepancy.robot_terms import UNITS
-from terrain.discrepancy.runs import Signals, Simulation, low_pass_of, measured_channels, rows_of, signals_of
+from terrain.discrepancy.runs import (
+    Excluded,
+    Signals,
+    Simulation,
+    low_pass_of,
+    measured_channels,
+    rows_of,
+    signals_of,
+)
 from terrain.discrepancy.search import CauseFit, Problem, names_of, pooled, refit, rivals_of, search
 from terrain.discrepancy.verdict import Verdict
 from terrain.effects import BOUNDS, CHANNELS, Effect, effect_named

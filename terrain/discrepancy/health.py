@@ -34,7 +34,7 @@ from terrain.discrepancy.clocks import (
     shifts_of,
 )
 from terrain.discrepancy.evidence import Evidence
-from terrain.discrepancy.runs import INPUTS, LowPass, Rows, Signals, Simulation, rows_of
+from terrain.discrepancy.runs import INPUTS, Excluded, LowPass, Rows, Signals, Simulation, rows_of
 from terrain.effects import CHANNELS, GYRO, HEADING, INDEX, SPEED_X
 from terrain.records import Array
 from terrain.robots import Robot
@@ -729,13 +729,6 @@ MARGIN_S = 0.6  #: Tolerance of the time at which a predicted change arrives.
 FROZEN_RANGE, CLIPPED_SPREAD = 0.5, 0.1
 #: The end of a range is so far out at the least, over the largest size: idle currents rest at the other.
 FAR_END = 0.5
-
-
-class Excluded(NamedTuple):
-    """A run that is excluded as unfit, and why."""
-
-    run_id: str
-    reason: str
 
 
 class Clock(NamedTuple):

@@ -12,8 +12,16 @@ import numpy as np
 from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.discrepancy.diagnose import MIN_RUNS
 from terrain.discrepancy.evidence import MIN_CLUSTERS, N_BLOCKS, Evidence, evidence_at
-from terrain.discrepancy.health import Excluded, Fault, unfit_runs
-from terrain.discrepancy.runs import LowPass, Signals, Simulation, low_pass_of, measured_channels, rows_of
+from terrain.discrepancy.health import Fault, unfit_runs
+from terrain.discrepancy.runs import (
+    Excluded,
+    LowPass,
+    Signals,
+    Simulation,
+    low_pass_of,
+    measured_channels,
+    rows_of,
+)
 from terrain.discrepancy.search import names_of
 from terrain.effects import CHANNELS
 from terrain.errors import DataError, TerrainError

@@ -175,12 +175,47 @@ class Signals:
         return self.start_s + self.dt_s * np.arange(len(self))
 
 
+class Excluded(NamedTuple):
+    """A run that is excluded from the comparison, and why."""
+
+    run_id: str
+    reason: str
+
+
+def comparable(runs: Sequence[RunLog], robot: Robot) -> tuple[tuple[Signals, ...], tuple[Excluded, ...]]:
+    """Return the signals of runs that can be compared with the simulation, and why the others cannot be.
+
+    A run on another clock than most is one of the latter: one low-pass serves all that are compared.
+
+    Raises
+    ------
+    DataError
+        if no run can be compared, with the reason of the first.
+    """
+    signals, excluded = [], []
+    for run in runs:
+        try:
+            signals.append(signals_of(run, robot))
+        except DataError as error:
+            excluded.append(Excluded(run.run_id, str(error).removeprefix(f"run {run.run_id}: ")))
+    if not signals and excluded:
+        raise DataError(f"run {excluded[0].run_id}: {excluded[0].reason}")
+    rates = np.array([1 / run.dt_s for run in signals])
+    together = [(rates >= slow) & (rates <= (1 + SAME_CLOCK) * slow) for slow in rates]
+    usual = max(together, key=np.sum, default=rates > 0)
+    for other, rate_hz in ((signals[i].run_id, rates[i]) for i in np.flatnonzero(~usual)):
+        most_hz = float(np.median(rates[usual]))
+        reason = f"it is on a clock of {rate_hz:.3g} Hz, most runs are on one of {most_hz:.3g} Hz"
+        excluded.append(Excluded(other, reason))
+    return tuple(signals[i] for i in np.flatnonzero(usual)), tuple(excluded)
+
+
 def signals_of(run: RunLog, robot: Robot) -> Signals:
     """Return the signals of a run, resampled to one clock.
 
-    Currents of omni wheels, which drive in three directions, are magnitudes.  Others get the sign of the wheel speed
-    where the motor driver logs magnitudes only: if a wheel turns backward and its current is never negative.  Braking
-    cannot be seen in such a log.
+    Currents are compared where the motors of the robot are described.  Those of omni wheels, which drive in three
+    directions, are magnitudes.  Others get the sign of the wheel speed where the motor driver logs magnitudes only: if
+    a wheel turns backward and its current is never negative.  Braking cannot be seen in such a log.
 
     Raises
     ------
@@ -246,7 +281,8 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
     for channel, stamps_s, values in _measurements(run, robot, has_tilt, by_pose):
         measured[:, CHANNELS.index(channel)] = _resample(time_s, stamps_s, values)
     names = [f"current_{wheel}_a" for wheel in robot.wheels]
-    if set(names) <= set(wheels.channels):
+    # of motors that are not described no current is known: a traction of 1 N would count as 1 A
+    if robot.describes("motors") and set(names) <= set(wheels.channels):
         currents = wheels.columns(names)
         if robot.on_omni_wheels:
             currents = np.abs(currents)

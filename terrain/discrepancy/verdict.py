@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
 
-from terrain.discrepancy.health import Clock, Excluded, Fault
+from terrain.discrepancy.health import Clock, Fault
+from terrain.discrepancy.runs import Excluded
 from terrain.records import Array
 
 AGREE_P = 0.01

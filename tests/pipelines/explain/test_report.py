@@ -12,8 +12,8 @@ from terrain.discrepancy import verdict
 from terrain.discrepancy.diagnosed_runs import HeldOutGain
 from terrain.discrepancy.held_out import Change, ChannelGain, Comparison, Gain
 from terrain.discrepancy.learner import ChannelReference, Reference
-from terrain.discrepancy.runs import measured_channels
-from terrain.discrepancy.verdict import Clock, Excluded
+from terrain.discrepancy.runs import Excluded, measured_channels
+from terrain.discrepancy.verdict import Clock
 from terrain.robots import load_robot
 
 HUSKY = load_robot("husky")

@@ -12,6 +12,7 @@ from terrain.discrepancy.runs import (
     SETTLE_S,
     Signals,
     Simulation,
+    comparable,
     decimate,
     low_pass_of,
     measured_channels,
@@ -314,6 +315,32 @@ def test_a_hole_stays_unknown_and_nothing_else_is_lost(looked_at):
     assert np.isfinite(rows.sensitivity).all()
     away = (np.abs(rows.time_s - 9.5) > 2.5) & (np.abs(rows.time_s - 15.5) > 1.5)
     assert_allclose(rows.residual[away, c], before.residual[away, c], atol=2e-3)
+
+
+def test_runs_that_cannot_be_compared_are_excluded_each_with_its_reason(husky):
+    slow = with_stream(husky, "wheels", kept(husky.streams["wheels"], slice(None, None, 5)))
+    short = {name: kept(each, each.time_s < 3.0) for name, each in husky.streams.items()}
+    runs = [
+        replace(husky, run_id="a"),
+        replace(husky, run_id="b", streams=short),
+        replace(slow, run_id="c"),
+        replace(husky, run_id="d"),
+    ]
+    signals, excluded = comparable(runs, HUSKY)
+    assert [run.run_id for run in signals] == ["a", "d"]
+    assert [run.run_id for run in excluded] == ["b", "c"]
+    assert excluded[0].reason.startswith("its streams have")
+    assert excluded[1].reason == "it is on a clock of 10 Hz, most runs are on one of 50 Hz"
+    with pytest.raises(DataError, match="run b: its streams have"):
+        comparable(runs[1:2], HUSKY)
+    assert comparable([], HUSKY) == ((), ())
+
+
+def test_currents_are_compared_only_where_motors_are_described(husky):
+    robot = HUSKY.without("motors")
+    for name in (CURRENT, TURNING_CURRENT):
+        assert np.isfinite(channel(signals_of(husky, HUSKY), name)).all()
+        assert np.isnan(channel(signals_of(husky, robot), name)).all()
 
 
 def fake(dt_s, run_id="a", n=400):
