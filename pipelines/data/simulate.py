@@ -23,7 +23,7 @@ class Settings(BaseSettings):
     terrain: str = setting(..., "Name of a soil, 'all' for each in turn, 'course' or 'bench'.")
     scenario: str = setting(...)
     """stand, straight, arc, starts, climb, brake, circle, crab, spot_turn, complex, survey; slip, for learn-slip;
-    course on 'course', six_positions on 'bench'."""
+    course on 'course', six_positions on 'bench'; or a CSV file of commands, as next_drive.csv of explain."""
     out: Path = setting(..., "Folder of the new run folders.")
     runs: int = setting(1, "Number of runs for each terrain.", ge=1)
     duration_s: float | None = setting(None, "Length of a run in s.", option="--duration")
@@ -59,9 +59,10 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
     from terrain.effects import read_effects_of
     from terrain.files.atomic import ensure_writable
     from terrain.logs.run_folders import run_folder, write_run
+    from terrain.logs.tables import read_table
     from terrain.robots import load_robot
     from terrain.simulation.run import BENCH_TERRAIN, COURSE, run_id_of, simulate_run
-    from terrain.simulation.scenario import Conditions, Faults
+    from terrain.simulation.scenario import COMMANDS, Conditions, Faults, Scenario, from_commands
     from terrain.simulation.sensors import Gnss
     from terrain.terramechanics.soil import load_soil, soil_names
 
@@ -79,6 +80,9 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
     effects = read_effects_of(settings.effect, robot.drive)
     ensure_writable(out)
     terrains = soil_names() if settings.terrain == EVERY else (settings.terrain,)
+    commands = None
+    if scenario.lower().endswith(".csv"):
+        commands, scenario = read_table(Path(scenario), COMMANDS), Path(scenario).stem
     jobs = [(name, number) for name in terrains for number in range(1, settings.runs + 1)]
     for name, number in jobs:
         terrain = name if name in (COURSE, BENCH_TERRAIN) else load_soil(name).name
@@ -88,10 +92,13 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
     run_ids: list[str] = []
     total_s = 0.0
     for done, (name, number) in enumerate(jobs, 1):
+        driven: str | Scenario = scenario
+        if commands is not None:
+            driven = from_commands(scenario, robot, load_soil(name).name, commands)
         simulated = simulate_run(
             robot,
             name,
-            scenario,
+            driven,
             settings.seed,
             number,
             duration_s=settings.duration_s,

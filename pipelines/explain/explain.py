@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 EXAMPLE = "terrain explain --data raw/ --robot husky --out explained/"
 RESULTS = ("pipelines.explain.explanation",)  #: Modules of the results
 
-PAGE_FILE, EXTENDED_FILE, NEXT_FILE = "report.html", "extended.yaml", "next_drive.yaml"
+PAGE_FILE, EXTENDED_FILE = "report.html", "extended.yaml"
 
 
 class ExplainOptions(BaseSettings):
@@ -51,9 +51,9 @@ class Settings(ExplainOptions, AlignedRunsSettings):
 def run(settings: Settings, progress: Progress) -> ExplainResult:
     """Read runs, explain them as :func:`explain`, and write the page, the extended robot and the next drive."""
     import numpy as np
-    import yaml
 
     from terrain.discrepancy.diagnosed_runs import extended_effects
+    from terrain.discrepancy.next_drive import NEXT_FILE, commands_of, next_command
     from terrain.extension import extended_yaml
     from terrain.files.atomic import atomic_write, ensure_writable
     from terrain.robots import load_robot
@@ -80,6 +80,9 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
         found,
         model=model,
         skipped=tuple(skipped),
+        next_command=next_command(
+            found.diagnosis.next_drive, description, robot, found.diagnosed.terrains, str(out / NEXT_FILE)
+        ),
         n_pictures=None if settings.pictures == "all" else int(settings.pictures),
         page=out / PAGE_FILE,
         extended_file=extended_file if found.diagnosis.causes else None,
@@ -91,8 +94,7 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
     if (drive := result.diagnosis.next_drive) is None:
         (out / NEXT_FILE).unlink(missing_ok=True)  # of an earlier result
     else:
-        text = yaml.safe_dump(drive._asdict(), sort_keys=False, allow_unicode=True, width=10_000)
-        atomic_write(out / NEXT_FILE, text)
+        atomic_write(out / NEXT_FILE, commands_of(drive))
     result.report.save(out / PAGE_FILE)
     return result
 

@@ -262,8 +262,13 @@ def _details(result: ExplainResult) -> Iterator[Section]:
         stated = [*map(Text, powertrain.sentences), Text(given, "note")]
         yield Section("From commanded to measured wheel speeds", stated)
     if coming := diagnosis.next_drive:
-        slope = f", on a slope of {coming.grade_deg:g}°" if coming.grade_deg else ""
-        why = f"Scenario {coming.scenario}{slope}: {coming.reason}. In simulation first:"
+        where = (
+            f"on a slope of {coming.grade_deg:g}°, up which it starts" if coming.grade_deg else "on the level"
+        )
+        why = (
+            f"{coming.duration_s:.0f} s of commands in next_drive.csv (speeds and yaw rate over time), {where}, on a "
+            f"field of {coming.length_m:.0f} by {coming.width_m:.0f} m: {coming.reason}. In simulation first:"
+        )
         yield Section("What to drive next", [Text(why), Text(result.next_command or "", "code")])
     yield Section("What the residuals depend on", [*_dependence_parts(runs)])
     whole: Sequence[ComparedRun] = [*runs.compared, *result.gain.judged]

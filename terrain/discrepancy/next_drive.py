@@ -1,8 +1,9 @@
-"""The next drive: the scenario that best distinguishes what the runs could not, or excites what they did not.
+"""The next drive: commands that best distinguish what the runs could not, or excite what they did not.
 
-Every scenario of ``terrain simulate`` that the robot can drive is driven without noise, on the level and
-uphill, and the sensitivities of the effects in question are whitened like those of the runs, with
-variations from run to run marginalised.  Two effects are compared by their collinearity index
+A drive is designed leg by leg: twists within the speeds and turns of the runs, held for some seconds and reached by a
+soft or a hard ramp.  Sequences of legs are drawn, and the best ones are improved a leg at a time.  Each is driven
+without noise, on the level and uphill, and the sensitivities of the effects in question are whitened like those of
+the runs, with variations from run to run marginalised.  Two effects are compared by their collinearity index
 ``1 / sqrt(1 - r)``,
 ``r`` the largest correlation of a change by the one with a change by the other: 1 is orthogonal, above 10
 they cannot be distinguished (Brun et al., Water Resources Research 2001, of two normalised columns).
@@ -12,8 +13,11 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from io import StringIO
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,20 +35,27 @@ from terrain.discrepancy.robot_terms import listed
 from terrain.discrepancy.search import names_of
 from terrain.discrepancy.verdict import Limit, NextDrive
 from terrain.effects import BOUNDS, CHANNELS, CURRENT, effect_named
-from terrain.errors import ConfigError
 from terrain.kinematics.commands import wheel_motion
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot
 from terrain.signals import low_pass
 from terrain.simulation.plants.planar import move
-from terrain.simulation.scenario import RATE_HZ, SCENARIOS, make_scenario
+from terrain.simulation.scenario import COMMANDS, RATE_HZ, SPOT_RADPS, STAND, Leg, fastest_mps_of, from_legs
 
 DEFAULT_SOIL, HARD_SOIL, NEXT_RUNS = "grass", "tiles", 8
 """Of the command that simulates the next drive: a soil, one for robots that get stuck on it, and as many runs
 as the blind trials have."""
 
+NEXT_FILE = "next_drive.csv"  #: Of commands, in the folder of the results
+
 GRADES_DEG = (0.0, 6.0)  #: Level, and a slope that every robot here climbs
-LONGEST_S = 40.0  #: Longest part of a scenario that is simulated
+
+#: A drive is as long as that many legs, drawn so often, the best so many improved by changing each leg once so often.
+N_LEGS, N_DRAWN, N_BEST, N_CHANGES = 12, 24, 2, 2
+HOLDS_S, ACCELS_MPS2 = (1.5, 3.0, 5.0), (0.5, 1.0)  #: Of legs; a hard ramp is that of the scenarios
+LEAST_MPS = 0.5  #: Fastest speed of a design if the runs were slower, as far as the robot reaches it
+#: Room that a drive may take, in metres and in seconds at its fastest speed, the larger of the two.
+ROOM_M, ROOM_S = 12.0, 12.0
 CLOCK_HZ = RATE_HZ / 2  #: Of the replay: half the rate of the commands is five times what they hold
 FOLLOW_S = 0.1  #: Lag of wheels and steering behind their commands; assumed
 
@@ -74,26 +85,31 @@ def next_drive(
     logged = runs.measured_channels(info.rows)
     if sets:
         return _separating_drive(simulation, sets, logged, info)
+    if not missed:
+        return None
     names, bound = [limit.name for limit in missed], np.array([MOST[limit.name] for limit in missed])
-    before, best, answer = np.array([limit.detection_limit for limit in missed]), 0.0, None
-    for scenario, grade_deg, a in _drives(simulation, names, logged, info) if missed else ():
+    before = np.array([limit.detection_limit for limit in missed])
+
+    def limits(a: Array) -> tuple[Array, Array]:
+        """Return the detection limits of a drive, and which effects it excites that the runs did not."""
         with np.errstate(divide="ignore"):
             limit = Z_SHOWN / np.sqrt(np.maximum(np.diag(a), 0.0))
-        excited = (limit < EXCITED_RATIO * bound) & (MIN_IMPROVEMENT_RATIO * limit < before)
-        # as many as possible; the size of the limits decides between equals
-        score = excited.sum() + float(np.mean(1.0 / (1.0 + np.minimum(limit / bound, 1e6))))
-        if excited.any() and score > best:
-            best, k, others = (
-                score,
-                int(np.argmin(np.where(excited, limit, np.inf) / bound)),
-                excited.sum() - 1,
-            )
-            beside = f", and {others} more that the runs do not excite" if others else ""
-            was = f"{before[k]:.2g}" if math.isfinite(before[k]) else "infinite"
-            change = f"falls from {was} to {limit[k]:.2g} {missed[k].unit}"
-            reason = f"the detection limit of {names[k]} {change}{beside}"
-            answer = NextDrive(scenario, grade_deg, reason)
-    return answer
+        return limit, (limit < EXCITED_RATIO * bound) & (MIN_IMPROVEMENT_RATIO * limit < before)
+
+    def score(a: Array) -> float:
+        """Return how many effects are excited; the size of the limits decides between equals."""
+        limit, excited = limits(a)
+        return float(excited.sum() + np.mean(1.0 / (1.0 + np.minimum(limit / bound, 1e6))))
+
+    best = _designed(simulation, names, logged, info, score)
+    limit, excited = limits(best.a)
+    if not excited.any():
+        return None
+    k, others = int(np.argmin(np.where(excited, limit, np.inf) / bound)), excited.sum() - 1
+    beside = f", and {others} more that the runs do not excite" if others else ""
+    was = f"{before[k]:.2g}" if math.isfinite(before[k]) else "infinite"
+    change = f"falls from {was} to {limit[k]:.2g} {missed[k].unit}"
+    return _answer(best, f"the detection limit of {names[k]} {change}{beside}")
 
 
 def _separating_drive(
@@ -105,14 +121,16 @@ def _separating_drive(
     twins = [(twin, group) for group in sets for name in group for twin in effect_named(name).twins]
     more = list(dict.fromkeys([to for (twin, to), group in twins if twin in group and to not in logged]))
     for lacking in ([], more) if more else ([],):
-        drives = [
-            (*_separation(sets, names, a), scenario, grade_deg)
-            for scenario, grade_deg, a in _drives(simulation, names, (*logged, *lacking), info)
-        ]
-        drives = [drive for drive in drives if drive[0] < SEPARABLE_INDEX]
-        if not drives:
+
+        def score(a: Array) -> float:
+            """Return how many sigmas separate the worst pair, those that cannot be distinguished last."""
+            index, power = _separation(sets, names, a)
+            return power if index < SEPARABLE_INDEX else -min(index, 1e9)
+
+        best = _designed(simulation, names, (*logged, *lacking), info, score)
+        index, power = _separation(sets, names, best.a)
+        if index >= SEPARABLE_INDEX:
             continue
-        index, power, scenario, grade_deg = max(drives, key=lambda drive: drive[1])
         now, power_now = _separation(sets, names, info.total(names)[0])
         if lacking:
             channels = listed(lacking)
@@ -125,7 +143,7 @@ def _separating_drive(
             if times < MIN_IMPROVEMENT_RATIO:
                 return None
             reason = f"it separates {groups} by {times:.2g} times as many sigmas as one of the runs"
-        return NextDrive(scenario, grade_deg, reason)
+        return _answer(best, reason)
     return None
 
 
@@ -147,50 +165,117 @@ def _separation(sets: Sequence[tuple[str, ...]], names: Sequence[str], a: Array)
     return index, power
 
 
-def _drives(
-    simulation: runs.Simulation, names: Sequence[str], channels: Sequence[str], info: Evidence
-) -> list[tuple[str, float, Array]]:
-    """Return each scenario on each grade, and its information (k, k) on parameters from channels.
+class _Design(NamedTuple):
+    """A drive, the slope that it is driven on, and its information (k, k) on parameters."""
 
-    Noise and scatter are those of the runs, or typical ones of channels that they do not have.  Of measurements only
-    the pattern of holes is used.
+    legs: tuple[Leg, ...]
+    grade_deg: float
+    a: Array
+
+
+def _designed(
+    simulation: runs.Simulation,
+    names: Sequence[str],
+    channels: Sequence[str],
+    info: Evidence,
+    score: Callable[[Array], float],
+) -> _Design:
+    """Return the drive with the best score of its information on parameters from channels.
+
+    Noise and scatter are those of the runs, or typical ones of channels that they do not have.
     """
-    robot, driven, signals, dt_s = simulation.robot, [], [], 1.0 / CLOCK_HZ
-    speed_mps = None  # that it cruises with
-    if not isinstance(robot, BicycleRobot):
-        if not robot.describes("motors"):
-            return []
-        if not robot.on_omni_wheels:
-            speed_mps = min(0.6 * robot.wheel_radius_m * robot.motors.speed_max_radps, 1.0)
-    for name in SCENARIOS:
-        try:
-            scenario = make_scenario(name, robot, "ground", speed_mps=speed_mps)
-        except ConfigError:  # which it cannot drive
-            continue
-        motion = wheel_motion(robot, scenario.twist[: round(LONGEST_S * RATE_HZ)], 1.0 / RATE_HZ)
+    rng, robot = np.random.default_rng(0), simulation.robot
+    draw, room_m = _legs_of(robot, info)
+    evaluate = partial(_information, simulation, names, channels, info)
+    grades = GRADES_DEG[:1] if robot.on_omni_wheels else GRADES_DEG  # those log no tilt
+
+    def drawn() -> tuple[Leg, ...]:
+        while True:
+            legs = (STAND, *[draw(rng) for _ in range(N_LEGS)], STAND)
+            if max(extent_of(legs)) <= room_m:
+                return legs
+
+    ranked: list[tuple[float, _Design]] = []
+    for grade_deg in grades:
+        sequences = [drawn() for _ in range(N_DRAWN)]
+        for legs, a in zip(sequences, evaluate(sequences, grade_deg), strict=True):
+            ranked.append((score(a), _Design(legs, grade_deg, a)))
+    ranked.sort(key=lambda pair: -pair[0])
+    best = ranked[:N_BEST]
+    for i, (value, design) in enumerate(best):
+        for _ in range(N_CHANGES):
+            legs = design.legs
+            changed = [(*legs[:k], draw(rng), *legs[k + 1 :]) for k in range(1, len(legs) - 1)]
+            changed = [each for each in changed if max(extent_of(each)) <= room_m]
+            for each, a in zip(changed, evaluate(changed, design.grade_deg) if changed else (), strict=True):
+                if (now := score(a)) > value:
+                    value, design = now, _Design(each, design.grade_deg, a)
+        best[i] = value, design
+    return max(best, key=lambda pair: pair[0])[1]
+
+
+def _legs_of(robot: Robot, info: Evidence) -> tuple[Callable[[np.random.Generator], Leg], float]:
+    """Return how a leg is drawn, within the speeds and turns of the runs, and the room of a drive."""
+    fastest_mps = float(np.quantile(np.concatenate([run.pace_mps for run in info.rows]), 0.99))
+    fastest_mps = min(max(fastest_mps, LEAST_MPS), 0.8 * fastest_mps_of(robot))
+    turned = [np.abs(run.predicted[:, 0]) for run in info.rows]
+    yaw_radps = max(float(np.nanquantile(np.concatenate(turned), 0.99)), SPOT_RADPS)
+    sizes = np.array([-1.0, -0.5, 0.5, 1.0])
+
+    def draw(rng: np.random.Generator) -> Leg:
+        kind = rng.choice(["rest", "straight", "arc", "spot", "sideways"], p=[0.1, 0.35, 0.35, 0.1, 0.1])
+        speed_mps, turn = fastest_mps * rng.choice(sizes), rng.choice(sizes)
+        twist = np.array([0.0 if kind == "rest" else speed_mps, 0.0, 0.0])
+        if isinstance(robot, BicycleRobot):
+            twist[2] = speed_mps * math.tan(0.8 * robot.steering_max_rad * turn) / robot.wheelbase_m
+            twist[2] = np.clip(twist[2], -yaw_radps, yaw_radps) * (kind in ("arc", "spot"))
+        elif kind == "arc":
+            twist[2] = yaw_radps * turn
+        elif kind == "spot":
+            twist[:] = 0.0, 0.0, yaw_radps * turn
+        elif kind == "sideways" and robot.sideways:
+            twist[:] = speed_mps * rng.choice([0.0, 0.7]), fastest_mps * turn * 0.7, 0.0
+        return Leg(twist, float(rng.choice(HOLDS_S)), float(rng.choice(ACCELS_MPS2)))
+
+    return draw, max(ROOM_M, ROOM_S * fastest_mps)
+
+
+def extent_of(legs: Sequence[Leg]) -> tuple[float, float]:
+    """Return how far ahead and to the side of its start a drive reaches, without slip, as the size of its box."""
+    step = from_legs("", "ground", legs).twist / RATE_HZ
+    cos, sin = np.cos(np.cumsum(step[:, 2])), np.sin(np.cumsum(step[:, 2]))
+    x_m, y_m = np.cumsum(cos * step[:, 0] - sin * step[:, 1]), np.cumsum(sin * step[:, 0] + cos * step[:, 1])
+    return float(np.ptp(x_m)), float(np.ptp(y_m))
+
+
+def _information(
+    simulation: runs.Simulation,
+    names: Sequence[str],
+    channels: Sequence[str],
+    info: Evidence,
+    sequences: Sequence[Sequence[Leg]],
+    grade_deg: float,
+) -> Array:
+    """Return the information (sequences, k, k) of drives on a slope, which they start up."""
+    robot, signals, dt_s = simulation.robot, [], 1.0 / CLOCK_HZ
+    for legs in sequences:
+        motion = wheel_motion(robot, from_legs("", "ground", legs).twist, 1.0 / RATE_HZ)
         speed, steer = [
             np.ascontiguousarray(low_pass(x, 1.0 / RATE_HZ, FOLLOW_S)[:: round(RATE_HZ / CLOCK_HZ)])
             for x in (motion.wheel_speed_mps, motion.steer_rad)
         ]
-        level = np.zeros(len(speed))
+        grade = roll = np.zeros(len(speed))
+        # of measurements only the pattern of holes is used
         measured = np.full((len(speed), len(CHANNELS)), np.nan)
         measured[:, [CHANNELS.index(channel) for channel in channels]] = 0.0
         parallel = np.abs(np.exp(1j * steer).mean(axis=1)) > runs.PARALLEL
         measured[~parallel, CHANNELS.index(CURRENT)] = np.nan
-        for grade_deg in GRADES_DEG[:1] if robot.on_omni_wheels else GRADES_DEG:  # those log no tilt
-            grade = roll = level
-            if grade_deg:
-                flat = move(simulation.planar_on(""), simulation.vector, dt_s, speed, steer, level, level)
-                yaw, steepness = (
-                    np.cumsum(flat["yaw_rate_radps"]) / CLOCK_HZ,
-                    math.tan(math.radians(grade_deg)),
-                )
-                ahead, left = steepness * np.cos(yaw), -steepness * np.sin(yaw)
-                grade, roll = np.arctan(ahead / np.hypot(1.0, left)), np.arctan(left)
-            driven.append((name, grade_deg))
-            signals.append(runs.Signals("", "", dt_s, 0.0, speed, steer, grade, roll, measured))
-    if not signals:
-        return []
+        if grade_deg:
+            flat = move(simulation.planar_on(""), simulation.vector, dt_s, speed, steer, grade, roll)
+            yaw, steepness = np.cumsum(flat["yaw_rate_radps"]) * dt_s, math.tan(math.radians(grade_deg))
+            ahead, left = steepness * np.cos(yaw), -steepness * np.sin(yaw)
+            grade, roll = np.arctan(ahead / np.hypot(1.0, left)), np.arctan(left)
+        signals.append(runs.Signals("", "", dt_s, 0.0, speed, steer, grade, roll, measured))
     std = np.array([*TYPICAL_STD.values()])
     noise = Noise(np.zeros((len(std), 3)), np.zeros((len(std), ORDER + 1)), std)
     noise.growth[:, 0], noise.filters[:, 0] = std**2, 1.0
@@ -200,18 +285,45 @@ def _drives(
     scatter = {name: info.scatter[name] for name, assumed in simulation.scatter.items() if assumed > 0}
     about = runs.low_pass_of(signals), noise, scatter
     of_drives = evidence_at(signals, simulation, info.vector, names, *about)
-    a, _ = of_drives.clusters(of_drives.places(names))
-    return [(*drive, own) for drive, own in zip(driven, a, strict=True)]
+    return of_drives.clusters(of_drives.places(names))[0]
+
+
+def _answer(design: _Design, reason: str) -> NextDrive:
+    legs = tuple((*leg.twist.tolist(), leg.hold_s, leg.accel_mps2) for leg in design.legs)
+    duration_s = float(from_legs("", "ground", design.legs).time_s[-1])
+    return NextDrive(legs, design.grade_deg, reason, duration_s, *extent_of(design.legs))
+
+
+def commands_of(drive: NextDrive) -> str:
+    """Return a drive as a file of commands: CSV with the columns of :data:`terrain.simulation.scenario.COMMANDS`.
+
+    Examples
+    --------
+    >>> drive = NextDrive(((0.5, 0.0, 0.0, 1.0, 1.0),), 0.0, "", 1.5, 0.6, 0.0)
+    >>> print("".join(commands_of(drive).splitlines(True)[:3]), end="")
+    time_s,speed_x_mps,speed_y_mps,yaw_rate_radps
+    0.00,0.0000,0.0000,0.0000
+    0.02,0.0200,0.0000,0.0000
+    """
+    made = from_legs("", "ground", [Leg(np.array(leg[:3]), *leg[3:]) for leg in drive.legs])
+    rows = np.column_stack([made.time_s, made.twist]) + 0.0
+    text = StringIO()
+    np.savetxt(text, rows, fmt=["%.2f", *["%.4f"] * 3], delimiter=",", header=",".join(COMMANDS), comments="")
+    return text.getvalue()
 
 
 def next_command(
-    drive: NextDrive | None, description: str, robot: Robot, terrains: Sequence[runs.TerrainMatch]
+    drive: NextDrive | None,
+    description: str,
+    robot: Robot,
+    terrains: Sequence[runs.TerrainMatch],
+    commands: str = NEXT_FILE,
 ) -> str | None:
-    """Return the command that simulates the next drive; None where none is suggested."""
+    """Return the command that simulates the next drive, by its file; None where none is suggested."""
     if drive is None:
         return None
     default = DEFAULT_SOIL if runs.drivable(robot, DEFAULT_SOIL) else HARD_SOIL
     soil = next((match.soil for match in terrains if match.soil), default)
     grade = f" --grade {drive.grade_deg:g}" if drive.grade_deg else ""
-    words = f"--robot {shlex.quote(description)} --terrain {soil} --scenario {drive.scenario}{grade}"
+    words = f"--robot {shlex.quote(description)} --terrain {soil} --scenario {shlex.quote(commands)}{grade}"
     return f"terrain simulate {words} --runs {NEXT_RUNS} --out next_drive"

@@ -147,11 +147,16 @@ class Residual(NamedTuple):
 
 
 class NextDrive(NamedTuple):
-    """The next drive: a scenario of ``terrain simulate``, and what it would distinguish or reveal."""
+    """The next drive, and what it would distinguish or reveal."""
 
-    scenario: str
-    grade_deg: float
+    #: speed ahead and to the left in m/s, yaw rate in rad/s, for how many s it is held, and acceleration of the ramp
+    #: to it in m/s^2
+    legs: tuple[tuple[float, ...], ...]
+    grade_deg: float  #: slope that it is driven on, which it starts up
     reason: str
+    duration_s: float
+    length_m: float  #: size of the field that it takes, along and across the heading at its start
+    width_m: float
 
 
 class Covariance(NamedTuple):

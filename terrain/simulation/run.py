@@ -145,7 +145,7 @@ def simulate(
 def simulate_run(
     robot: Robot | str | Path,
     terrain: str,
-    scenario: str,
+    scenario: str | Scenario,
     seed: int = 0,
     number: int = 1,
     *,
@@ -166,7 +166,8 @@ def simulate_run(
     robot : swerve robot with all sections, or another robot with all but steering; or its name or YAML file
     terrain : name of a soil or path of its YAML file, or ``course`` for all soils in one run
     scenario : name of a scenario; ``course`` goes with the terrain ``course``, ``six_positions`` (the IMU alone, for
-        calibration) with ``bench``; ``slip`` sweeps the slip of the wheels under varied conditions
+        calibration) with ``bench``; ``slip`` sweeps the slip of the wheels under varied conditions; or what is to be
+        driven, as of :func:`~terrain.simulation.scenario.from_commands`
     seed, number : of what is drawn
     duration_s : length; the scenario's own by default
     vary : draw soil, slope, load, tyres and roughness for this run by ``data/soils`` and ``data/spread``
@@ -191,6 +192,10 @@ def simulate_run(
     """
     if isinstance(robot, str | Path):
         robot = load_robot(robot)
+    commands = scenario if isinstance(scenario, Scenario) else None
+    scenario = scenario.name if isinstance(scenario, Scenario) else scenario
+    if commands is not None and duration_s is not None:
+        raise ConfigError(f"scenario {scenario!r} is as long as its commands: leave the duration out")
     if effects and scenario in (BENCH, SLIP):
         raise ConfigError(f"scenario {scenario!r} is simulated without effects: leave them out")
     if scenario == BENCH:
@@ -226,7 +231,7 @@ def simulate_run(
     if planar and terrain == COURSE:
         raise ConfigError(f"robot {robot.name}: scenario {COURSE!r} is for swerve robots")
     drive_seed = int(driven.generate_state(1)[0])
-    drive = make_scenario(scenario, robot, list(soils), duration_s, seed=drive_seed)
+    drive = commands or make_scenario(scenario, robot, list(soils), duration_s, seed=drive_seed)
     ground: Any = soils
     options: dict[str, Any] = {"gnss": gnss}
     effects = effects or {}

@@ -248,11 +248,8 @@ def make_scenario(
         if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
             raise ConfigError(f"seed is {seed!r}, a whole number from 0 up is required")
         seed = np.random.default_rng(seed)
-    motors = robot.motors if isinstance(robot, SwerveRobot) else robot.completed.motors
-    wheels, radius_m, fastest_radps = robot.wheel_positions_m, robot.wheel_radius_m, motors.speed_max_radps
-    if isinstance(robot, BicycleRobot):
-        fastest_radps = min(fastest_radps, robot.speed_max_mps / radius_m)
-    fastest_mps = radius_m * fastest_radps
+    wheels, radius_m, fastest_mps = robot.wheel_positions_m, robot.wheel_radius_m, fastest_mps_of(robot)
+    fastest_radps = fastest_mps / radius_m
     if speed_mps is None:
         slow = car or fastest_mps < CRUISING_MPS
         speed_mps = CRUISING_SHARE * fastest_mps if slow else CRUISING_MPS
@@ -376,6 +373,62 @@ def make_scenario(
     time_s = np.arange(round(length_s * RATE_HZ) + 1) / RATE_HZ
     twist = _twists(legs, time_s, name in ("complex", "crab"))
     return Scenario(name, RATE_HZ, time_s, twist, (Patch(0.0, grounds[0]),))
+
+
+def from_legs(name: str, terrain: str, legs: Sequence[Leg]) -> Scenario:
+    """Return the scenario of legs one after the other, from rest.
+
+    Examples
+    --------
+    >>> drive = from_legs("there", "grass", [Leg(np.array([1.0, 0.0, 0.0]), 3.0), STAND])
+    >>> float(drive.time_s[-1]), drive.twist[[25, 100, -1], 0]
+    (6.0, array([0.5, 1. , 0. ]))
+    """
+    ramps_s = [_ramp_s(b.twist - a.twist, b.accel_mps2) for a, b in pairwise([STAND, *legs])]
+    length_s = sum(ramps_s) + sum(leg.hold_s for leg in legs)
+    time_s = np.arange(round(length_s * RATE_HZ) + 1) / RATE_HZ
+    return Scenario(name, RATE_HZ, time_s, _twists(legs, time_s), (Patch(0.0, terrain),))
+
+
+COMMANDS: tuple[str, ...] = (
+    "time_s",
+    "speed_x_mps",
+    "speed_y_mps",
+    "yaw_rate_radps",
+)  # columns of their file
+
+
+def from_commands(name: str, robot: Robot, terrain: str, commands: Array) -> Scenario:
+    """Return the scenario of commands (n, 4) with the columns :data:`COMMANDS`, straight lines between them.
+
+    Raises
+    ------
+    ConfigError
+        if a number is not finite, times do not rise, the drive is too long, or the robot cannot drive it.
+    """
+    if len(commands) < 2 or not np.isfinite(commands).all() or not (np.diff(commands[:, 0]) > 0).all():
+        raise ConfigError(f"{name}: two rows or more of finite numbers at rising times are required")
+    length_s, fastest_mps = float(np.ptp(commands[:, 0])), fastest_mps_of(robot)
+    if length_s > LONGEST_S:
+        raise ConfigError(f"{name}: it lasts {length_s:g} s, at most {LONGEST_S:g} s are simulated")
+    if not robot.sideways and commands[:, 2].any():
+        raise ConfigError(f"{name}: speed_y_mps is not 0, and robot {robot.name} does not drive sideways")
+    speed_mps = np.hypot(*commands[:, 1:3].T)
+    if speed_mps.max() > fastest_mps:
+        raise ConfigError(
+            f"{name}: {speed_mps.max():g} m/s in row {int(np.argmax(speed_mps)) + 1}: robot {robot.name} drives up to "
+            f"{fastest_mps:g} m/s"
+        )
+    time_s = np.arange(math.floor(length_s * RATE_HZ + 1e-6) + 1) / RATE_HZ
+    twist = np.column_stack([np.interp(time_s, commands[:, 0] - commands[0, 0], x) for x in commands.T[1:]])
+    return Scenario(name, RATE_HZ, time_s, twist, (Patch(0.0, terrain),))
+
+
+def fastest_mps_of(robot: Robot) -> float:
+    """Return the speed of the fastest wheels of a robot, or of a car; infinite where the description has none."""
+    motors = robot.motors if isinstance(robot, SwerveRobot) else robot.completed.motors
+    limit_mps = robot.wheel_radius_m * motors.speed_max_radps
+    return min(limit_mps, robot.speed_max_mps) if isinstance(robot, BicycleRobot) else limit_mps
 
 
 def _rounds(terrains: tuple[str, ...], rng: np.random.Generator) -> Iterator[tuple[list[Patch], float]]:

@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MAX_LINES = {"terrain": 47_250, "features": 2_750, "pipelines": 18_800, "tests": 42_270}
+MAX_LINES = {"terrain": 55_000, "features": 2_750, "pipelines": 21_000, "tests": 48_000}
 """Lines of Python, docstrings included."""
 
 

@@ -4,7 +4,7 @@ import pytest
 from pipelines.data.simulate import Settings
 from pipelines.data.simulate import run as simulate_with
 from pipelines.report.results import silent
-from terrain.errors import LogError
+from terrain.errors import ConfigError, LogError
 from terrain.files.names import data_folder
 from terrain.logs.run_folders import find_runs, read_run
 from terrain.robots import load_robot
@@ -96,3 +96,40 @@ def test_a_soil_of_ones_own_goes_by_its_name_and_a_run_that_is_there_is_left_alo
     with pytest.raises(LogError, match="orchard_straight_02: is there already"):
         simulate_runs("agrimaro", str(own), "straight", out, runs=3, duration_s=4.0)
     assert [path.name for path in out.iterdir()] == ["orchard_straight_02"]
+
+
+COMMANDS = "time_s,speed_x_mps,speed_y_mps,yaw_rate_radps\n"
+
+
+@pytest.mark.parametrize("robot", ["agrimaro", "husky", "marmotte"])
+def test_commands_of_a_file_are_driven(tmp_path, robot):
+    (tmp_path / "turn.csv").write_text(
+        COMMANDS + "5,0,0,0\n6,0.4,0,0\n8,0.4,0,0\n9,0.4,0,0.2\n12,0.4,0,0.2\n"
+    )
+    made = simulate_runs(robot, "grass", str(tmp_path / "turn.csv"), tmp_path / "out", runs=2)
+    assert made.run_ids == ("grass_turn_01", "grass_turn_02")
+    run = read_run(tmp_path / "out" / "grass_turn_01")
+    truth = run.streams["truth"]
+    name = "speed_x_mps" if "speed_x_mps" in truth.channels else "speed_mps"
+    speed, turn = (np.interp(6.5, truth.time_s, truth.channel(each)) for each in (name, "yaw_rate_radps"))
+    assert 0.15 < speed < 0.41
+    assert 0.05 < turn < 0.21
+    assert run.streams["wheels"].duration_s == pytest.approx(7.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("rows", "options", "says"),
+    [
+        ("0,0,0,0\n", {}, "two rows or more"),
+        ("0,0,0,0\n0,1,0,0\n", {}, "rising times"),
+        ("0,0,0,0\n1,,0,0\n", {}, "finite numbers"),
+        ("0,0,0,0\n1,0.5,0.1,0\n", {}, "does not drive sideways"),
+        ("0,0,0,0\n1,50,0,0\n", {}, "50 m/s in row 2: robot husky drives up to"),
+        ("0,0,0,0\n9000,0.5,0,0\n", {}, "at most 3600 s"),
+        ("0,0,0,0\n9,0.5,0,0\n", {"duration_s": 4.0}, "leave the duration out"),
+    ],
+)
+def test_commands_that_cannot_be_driven_are_refused(tmp_path, rows, options, says):
+    (tmp_path / "turn.csv").write_text(COMMANDS + rows)
+    with pytest.raises(ConfigError, match=says):
+        simulate_runs("husky", "grass", str(tmp_path / "turn.csv"), tmp_path / "out", **options)

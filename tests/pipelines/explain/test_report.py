@@ -137,13 +137,13 @@ LEFT = (
             {
                 "clocks": (Clock("r3", 0.0123, 0.001), Clock("r4", np.nan, np.inf)),
                 "excluded_runs": (Excluded("r<9>", "its gyro stands still"),),
-                "next_drive": verdict.NextDrive("climb", 6.0, "it parts them"),
+                "next_drive": verdict.NextDrive(((0.5, 0, 0, 2, 1),), 6.0, "it parts them", 62, 9.6, 4),
             },
             (
                 f"r3 0.0123 0.0010 r4 {NOT_KNOWN}",
                 "excluded as unfit: r<9>.",
                 "r<9> its gyro stands still",
-                "Scenario climb, on a slope of 6°: it parts",
+                "62 s of commands in next_drive.csv (speeds and yaw rate over time), on a slope of 6°",
             ),
         ),
     ],
