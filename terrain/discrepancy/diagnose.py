@@ -17,7 +17,9 @@ import numpy as np
 from terrain.discrepancy import constancy, verdict
 from terrain.discrepancy.clocks import latencies_of, shifts_of
 from terrain.discrepancy.evidence import EXCITED_RATIO, Z_EFFECT, Evidence, move_point, partial_information
-from terrain.discrepancy.health import clocks_of, faults_of, repaired, unfit_runs
+from terrain.discrepancy.health.fault import repaired
+from terrain.discrepancy.health.faults import faults_of
+from terrain.discrepancy.health.unfit import clocks_of, unfit_runs
 from terrain.discrepancy.next_drive import MOST, next_drive
 from terrain.discrepancy.probes import TILT_INPUTS, ProbeResult, probe_residuals
 from terrain.discrepancy.robot_terms import UNITS

@@ -13,7 +13,7 @@ from terrain.discrepancy.compared import ComparedRun, compare_runs, without_leve
 from terrain.discrepancy.constancy import PartValues, part_values
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.evidence import evidence_at
-from terrain.discrepancy.health import repaired
+from terrain.discrepancy.health.fault import repaired
 from terrain.discrepancy.held_out import (
     HOLD_OUT_FROM,
     Comparison,

@@ -12,7 +12,8 @@ import numpy as np
 from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.discrepancy.diagnose import MIN_RUNS
 from terrain.discrepancy.evidence import MIN_CLUSTERS, N_BLOCKS, Evidence, evidence_at
-from terrain.discrepancy.health import Fault, unfit_runs
+from terrain.discrepancy.health.fault import Fault
+from terrain.discrepancy.health.unfit import unfit_runs
 from terrain.discrepancy.runs import (
     Excluded,
     LowPass,

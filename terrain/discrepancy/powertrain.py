@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.bootstrap import LEVEL, bootstrap_counts, percentile_interval
-from terrain.discrepancy.health import Fault
+from terrain.discrepancy.health.fault import Fault
 from terrain.discrepancy.robot_terms import listed
 from terrain.identify import Fit, Parameter, deal, folds, identify
 from terrain.kernels import njit, record

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
 
-from terrain.discrepancy.health import Clock, Fault
+from terrain.discrepancy.health.fault import Fault
+from terrain.discrepancy.health.unfit import Clock
 from terrain.discrepancy.runs import Excluded
 from terrain.records import Array
 

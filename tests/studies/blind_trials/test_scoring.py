@@ -20,7 +20,7 @@ from studies.blind_trials.trial import (
     cases_of,
     run_trial,
 )
-from terrain.discrepancy.health import Column, FaultKind
+from terrain.discrepancy.health.fault import Column, FaultKind
 from terrain.discrepancy.verdict import Clock, RunGroup, Value, Verdict
 
 RIGHT = Trial(

@@ -26,7 +26,7 @@ from studies.blind_trials.drives import (
 from studies.blind_trials.limits import Limits, Sensing, confusable_class, limits_of
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.diagnosed_runs import simulation_for
-from terrain.discrepancy.health import Column, FaultKind
+from terrain.discrepancy.health.fault import Column, FaultKind
 from terrain.discrepancy.held_out import split_runs
 from terrain.discrepancy.runs import Simulation
 from terrain.discrepancy.verdict import Verdict
@@ -375,7 +375,7 @@ class WrittenFault(NamedTuple):
     drives: tuple[str, ...]
     stream: str
     write: Callable[[Stream, Robot], Stream]
-    kind: FaultKind  #: of the statement, as :class:`terrain.discrepancy.health.Change` has it
+    kind: FaultKind  #: of the statement, as :class:`terrain.discrepancy.health.fault.Change` has it
     column: Column
     word: str = ""  #: in the sentence
 

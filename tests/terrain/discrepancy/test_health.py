@@ -15,28 +15,13 @@ from studies.blind_trials.trial import hidden_runs, simulation_of, with_late_str
 
 from pipelines.data.datasets import load_runs
 from terrain.discrepancy.clocks import latencies_of, shifts_of
-from terrain.discrepancy.health import (
-    AMPS,
-    KEYS,
-    A,
-    Agreement,
-    Change,
-    Column,
-    FaultKind,
-    G,
-    X,
-    agreement_of,
-    clocks_of,
-    faults_of,
-    likeliest,
-    odd_runs,
-    on_own_clocks,
-    options_of,
-    reading_of,
-    repaired,
-    stalled_runs,
-    unfit_runs,
-)
+from terrain.discrepancy.health.agreement import AMPS, A, Agreement, G, X, agreement_of, on_own_clocks
+from terrain.discrepancy.health.fault import Change, Column, FaultKind, repaired
+from terrain.discrepancy.health.faults import faults_of
+from terrain.discrepancy.health.readings import reading_of
+from terrain.discrepancy.health.response import odd_runs, stalled_runs
+from terrain.discrepancy.health.unfit import clocks_of, unfit_runs
+from terrain.discrepancy.health.units import KEYS, likeliest, options_of
 from terrain.discrepancy.runs import Simulation, low_pass_of, rows_of, signals_of
 from terrain.effects import CHANNELS, GYRO, HEADING, SPEED_X
 from terrain.errors import DataError

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from terrain.discrepancy.diagnosed_runs import extended_effects
-from terrain.discrepancy.health import Change, Column, Fault, FaultKind
+from terrain.discrepancy.health.fault import Change, Column, Fault, FaultKind
 from terrain.discrepancy.held_out import gain_of_signals, repair_held_out, split_runs
 from terrain.discrepancy.runs import Simulation, low_pass_of, signals_of
 from terrain.discrepancy.verdict import INTERVAL_T

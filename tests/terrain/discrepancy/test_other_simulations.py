@@ -7,7 +7,7 @@ import pytest
 
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.diagnosed_runs import diagnose_runs, simulation_for
-from terrain.discrepancy.health import candidate_changes
+from terrain.discrepancy.health.readings import candidate_changes
 from terrain.discrepancy.powertrain import traces_of
 from terrain.discrepancy.robot_terms import in_robot_terms, value_in_robot_terms
 from terrain.discrepancy.runs import signals_of

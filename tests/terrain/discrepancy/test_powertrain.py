@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from terrain.discrepancy.health import Change, Column, Fault, FaultKind
+from terrain.discrepancy.health.fault import Change, Column, Fault, FaultKind
 from terrain.discrepancy.powertrain import ABSENT, NAMES, STEP_S, PartStatus, follow, powertrain_of
 from terrain.logs.drive import DriveRobot, find_runs
 from terrain.records import RunLog, Stream

@@ -1,0 +1,1 @@
+"""Health of logs: faults of columns with their repair, and runs that are unfit."""

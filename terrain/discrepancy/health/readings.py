@@ -1,0 +1,135 @@
+"""Signs that are turned and columns that are exchanged, found by what makes all channels of a run agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.discrepancy.health.agreement import FOLLOWERS, Agreement, H
+from terrain.discrepancy.health.fault import (
+    KINDS,
+    Change,
+    Changes,
+    Column,
+    Fault,
+    FaultKind,
+    change_in_words,
+    fault_of,
+    session_of,
+)
+from terrain.records import Array
+from terrain.robots import Robot
+
+# Every reading of a run that is one fault away is tried: a change of its measured channels, or of its wheels,
+# which are then simulated again.  Under the right one all channels follow the wheels, each with a gain above
+# zero; the likelihood that a reading gains is summed over the runs that it mends.
+
+#: A channel does not follow the wheels below the first correlation about zero, and does over the second.  Of measured
+#: runs, those that slip hardly fall below 0.8.
+TURNED, RIGHT = 0.3, 0.7
+#: A channel that half follows the wheels, as one wheel's do, is mended if its correlation rises by the first and to
+#: over the second.
+RISE, CLEAR = 0.25, 0.95
+
+LOSS = 0.1  #: Largest loss of correlation of any other channel under a reading that mends one.
+#: Twice the log-likelihood that a reading has to gain in a run: odds of e^10, over a score of readings and hundreds
+#: of runs.
+GAIN = 20.0
+#: Readings whose gains differ by less, or by less than that ratio, cannot be distinguished.
+TIE, TIE_RATIO = 10.0, 0.03
+
+WORDS = (
+    *("gyro", "speed", "lateral speed", "accelerometer"),
+    *("sum of the currents", "difference of the currents", "heading rate"),
+)
+
+
+class Reading(NamedTuple):
+    """What a change makes of runs."""
+
+    change: Change  #: tried
+    correlation: Array  #: (runs, channels) under it
+    gain: Array  #: (runs,) of twice the log-likelihood
+    mends: Array  #: (runs,) whether a channel follows the wheels that did not, and none is worse
+    #: (runs,) whether the gain is as clear and none is worse; a channel may have followed before
+    suits: Array
+
+
+def candidate_changes(robot: Robot) -> Changes:
+    """Return the signs and exchanges that are tried, those of fewest columns first."""
+    sign, swapped, n_wheels = FaultKind.SIGN, FaultKind.SWAPPED, len(robot.rate_channels)
+    single = (Column.GYRO, Column.HEADING, Column.SPEED, Column.ACCEL, Column.CURRENTS)
+    changes = [*(Change(sign, column, -1.0) for column in single), Change(swapped, Column.SPEED)]
+    if robot.skids:
+        changes += [Change(swapped, column) for column in (Column.CURRENTS, Column.WHEELS, Column.SIDES)]
+    else:
+        changes += [Change(swapped, Column.WHEELS, pair=pair) for pair in combinations(range(n_wheels), 2)]
+    each = range(n_wheels) if n_wheels > 1 else ()
+    return (*changes, *(Change(sign, Column.WHEELS, -1.0, wheel) for wheel in (-1, *each)))
+
+
+def reading_of(change: Change, before: Agreement, after: Agreement) -> Reading:
+    """Return what a change makes of runs."""
+    old, new = before.correlation[:, FOLLOWERS], after.correlation[:, FOLLOWERS]
+    gain = after.likelihood.sum(axis=1) - before.likelihood.sum(axis=1)
+    turned = (old < TURNED) & (new > RIGHT)
+    asked = old != 0.0  # what a run does not show cannot be wrong in it
+    mended = (asked & (turned | ((new - old > RISE) & (new > CLEAR)))).any(axis=1)
+    worse = ((new < old - LOSS) & (old > RIGHT)).any(axis=1)
+    suits = ~worse & (gain > GAIN)
+    return Reading(change, after.correlation, gain, mended & suits, suits)
+
+
+def turned_fault(
+    before: Agreement, tried: Callable[[Change, Sequence[int]], Reading], ids: Sequence[str], robot: Robot
+) -> Fault | None:
+    """Return the sign or exchange that mends most, or None if there is none.
+
+    It is the reading that gains most over the runs that it mends.  Those that are as good on the same runs are mirror
+    images, left for right or ahead for back: the change of fewest columns is taken, and the diagnosis is that of
+    either but for the side.  The runs that have the fault are those that it suits, and of their sessions those that
+    cannot say: a run that drives straight measures no sign of a gyro; it has that of the others.
+    """
+    old = before.correlation
+    fit = old[:, FOLLOWERS]
+    suspects = np.flatnonzero(((fit != 0.0) & (fit < RIGHT)).any(axis=1)).tolist()
+    readings = [tried(change, suspects) for change in candidate_changes(robot)] if suspects else []
+    first = max(readings, key=lambda reading: float(reading.gain[reading.mends].sum()), default=None)
+    if first is None or not first.mends.any():
+        return None
+    most = float(first.gain[first.mends].sum())
+    change, *rivals = (
+        reading.change
+        for reading in readings
+        if reading.mends[first.mends].all()
+        and most - float(reading.gain[first.mends].sum()) < max(TIE, TIE_RATIO * most)
+    )
+    best = tried(change, range(len(ids)))
+    rise, session = best.correlation - old, [session_of(run_id) for run_id in ids]
+    shift = np.median(np.abs(rise)[best.mends], axis=0)
+    shows = [c for c in FOLLOWERS if shift[c] > RISE]
+    has = set(np.flatnonzero(best.suits).tolist())
+    for name in {session[i] for i in has}:
+        members = [i for i in range(len(ids)) if session[i] == name]
+        if all(i in has for i in members if (np.abs(old[i, shows]) > RIGHT).any()):
+            has |= set(members)
+    # how it is seen: the gains of the channels that it turns
+    shown, words = [i for i in sorted(has) if best.mends[i]], []
+    gains, asked = before.gain[shown], (old[shown] != 0.0) & np.isfinite(before.gain[shown])
+    for c in FOLLOWERS:
+        on = asked[:, c]
+        own = c in KINDS[change.column].channels or change.of_wheels
+        if own and on.any() and np.median(rise[shown][on, c]) > RISE:
+            text = f"the {WORDS[c]} follows the wheels with the factor {np.median(gains[on, c]):.2f}"
+            both = on & np.isfinite(gains[:, H])
+            if change.column is Column.GYRO and both.any():
+                text += f", and the heading rate with {float(np.median(gains[both, c] / gains[both, H])):.2f}"
+            words.append(text)
+    seen = f": {' and '.join(words)}"
+    if rivals:
+        others = " or ".join(change_in_words(rival, robot)[0] for rival in rivals)
+        seen += f" (these channels cannot distinguish it from another reading: {others})"
+    return fault_of(change, sorted(has), ids, seen, robot)
