@@ -14,9 +14,9 @@ from pipelines.explain.statements import (
     gain_text,
     in_words_of,
     reference_text,
-    split_ruled_out,
     varying_text,
     verdict_text,
+    would_have_shown,
 )
 from pipelines.report.numbers import enumerated, format_value, sentence
 from pipelines.report.results import Result, as_json, described
@@ -163,7 +163,7 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
         yield Text(varying_text(each))
     if result.gain.black_box is not None:
         yield Text(reference_text(result.gain.black_box))
-    if n := len(diagnosis.not_excited):
+    if n := len(diagnosis.not_shown):
         of = len(diagnosis.detection_limits)
         yield Text(f"Of {of} parameters that may be wrong, {n} could not have been detected.")
     for note in result.notes:
@@ -222,19 +222,22 @@ def _gain_parts(measured: HeldOutGain) -> Iterator[Part]:
 
 
 def _open_parts(diagnosis: Diagnosis) -> Iterator[Part]:
-    """Yield the effects that were withdrawn, what is left unexplained, and the effects that are ruled out."""
-    withdrawn, ruled_out = split_ruled_out(diagnosis)
-    speaks = "These reduce the residual, and something speaks against each as its cause."
-    shown = "These runs would have shown them."
-    for effects, title, note in ((withdrawn, "withdrawn", speaks), (ruled_out, "ruled out", shown)):
-        rows: list[tuple[Any, ...]] = []
-        for each in effects:
-            values = values_with_intervals(each.parameters)
-            rows.append((effect_label(each.name), values, sentence(each.reason), each.z))
-        if rows:
-            yield Table((title, "value it would have", WHY, Column("z", Z)), rows, note=note)
+    """Yield the candidates, what is left unexplained, and the effects that are ruled out."""
+    rows: list[tuple[Any, ...]] = []
+    for each in diagnosis.candidates:
+        values = values_with_intervals(each.parameters)
+        rows.append((effect_label(each.name), values, sentence(each.reason), each.z))
+    if rows:
+        note = "These reduce the residual, and something speaks against each as its cause."
+        yield Table(("candidate", "value it would have", WHY, Column("z", Z)), rows, note=note)
+    rows = [(effect_label(each.name), sentence(each.reason), each.z) for each in would_have_shown(diagnosis)]
+    if rows:
+        note = "These runs would have shown them."
+        yield Table(("ruled out", WHY, Column("z", Z)), rows, note=note)
     if diagnosis.unexplained:
-        alike = {each.name: f"resembles {effect_label(each.name)}, which was withdrawn" for each in withdrawn}
+        alike = {
+            each.name: f"resembles {effect_label(each.name)}, a candidate" for each in diagnosis.candidates
+        }
         unexplained = []
         for left in diagnosis.unexplained:
             what = alike.get(left.input, f"depends on {left.input}")
@@ -253,7 +256,7 @@ def _details(result: ExplainResult) -> Iterator[Section]:
     statements = [tuple(each.text.split(": ", 1)) for each in result.statements]
     yield Section("Channel by channel", [Pairs(statements)])
     yield Section("Gain on held-out runs, channel by channel", [*_gain_parts(result.gain)])
-    yield Section("What was withdrawn, and what is unexplained", [*_open_parts(diagnosis)])
+    yield Section("Candidates, and what is unexplained", [*_open_parts(diagnosis)])
     if (powertrain := result.powertrain) is not None:
         given = (
             "The simulation is given the measured wheel speeds, so that this is no part of the residuals. "
@@ -278,10 +281,10 @@ def _details(result: ExplainResult) -> Iterator[Section]:
     yield Section("Whole runs", drawn)
     limits = []
     for limit in diagnosis.detection_limits:
-        missed = limit in diagnosis.not_excited
+        missed = limit in diagnosis.not_shown
         limits.append((limit_text(limit, missed), not missed, limit.needs))
     meaning = "Not detected does not mean absent: at its limit an effect is found nine times in ten."
-    heads = Column("detection limit", long=True), "excited by the driving", NEEDS
+    heads = Column("detection limit", long=True), "shown by these drives", NEEDS
     yield Section("What would not have been detected", [Table(heads, limits, note=meaning)])
     health: list[Part] = []
     if diagnosis.excluded_runs:

@@ -125,15 +125,15 @@ def _clauses(of: Statement, diagnosis: Diagnosis, robot: Robot) -> Iterator[str]
             size_unit = "" if parameter.unit == "ratio" else f" {UNITS.get(parameter.unit, parameter.unit)}"
             yield f"the {parameter.label} differs from run to run by {size}{size_unit}"
     rest = f"{after if math.isfinite(after) else before:.2g} {unit}"
-    withdrawn = {effect.name: effect.parameters for effect in diagnosis.ruled_out if effect.parameters}
+    candidates = {effect.name: effect.parameters for effect in diagnosis.candidates}
     for left in diagnosis.unexplained:
         constant = left.input == "constant"
         if left.channel != channel or (constant and not repaired and math.isfinite(level)):
             continue  # that is the level already stated
         many, one, what = "depend", "depends", f"on {left.input}"
-        if left.input in withdrawn:
-            terms = in_robot_terms(left.input, withdrawn[left.input], robot)
-            many, one, what = "look", "looks", f"like {terms}, a cause that was withdrawn"
+        if left.input in candidates:
+            terms = in_robot_terms(left.input, candidates[left.input], robot)
+            many, one, what = "look", "looks", f"like {terms}, a candidate that did not earn its name"
         elif constant:
             many, one, what = "are", "is", "a constant offset"
         if repaired:
@@ -142,15 +142,10 @@ def _clauses(of: Statement, diagnosis: Diagnosis, robot: Robot) -> Iterator[str]
             yield f"measured and simulated are {rest} rms apart, which {one} {what}"
 
 
-def split_ruled_out(diagnosis: Diagnosis) -> tuple[list[RuledOut], list[RuledOut]]:
-    """Return causes that were withdrawn, and effects that runs would have shown.
-
-    What the runs did not excite is neither.
-    """
-    missed = {limit.name for limit in diagnosis.not_excited}
-    withdrawn = [effect for effect in diagnosis.ruled_out if effect.parameters]
-    others = [effect for effect in diagnosis.ruled_out if not effect.parameters]
-    return withdrawn, [e for e in others if not {p.name for p in effect_named(e.name).parameters} <= missed]
+def would_have_shown(diagnosis: Diagnosis) -> list[RuledOut]:
+    """Return the effects that are ruled out: those that these runs would have shown."""
+    missed = {limit.name for limit in diagnosis.not_shown}
+    return [e for e in diagnosis.ruled_out if not {p.name for p in effect_named(e.name).parameters} <= missed]
 
 
 def notes_of(

@@ -33,7 +33,7 @@ from terrain.discrepancy.runs import (
     signals_of,
 )
 from terrain.discrepancy.search import CauseFit, Problem, names_of, pooled, refit, rivals_of, search
-from terrain.discrepancy.verdict import Verdict
+from terrain.discrepancy.verdict import Tier
 from terrain.effects import BOUNDS, CHANNELS, Effect, effect_named
 from terrain.errors import DataError
 from terrain.records import Array, RunLog
@@ -41,7 +41,10 @@ from terrain.records import Array, RunLog
 MIN_RUNS = 3  #: Least number of runs: with fewer none is left to validate a fit
 
 BLIND_RATIO = 0.05
-"""Ratio of the library that may be not excited before the verdict ``none`` becomes ``not_excited``."""
+"""Ratio of the parameters that may not be shown before a diagnosis without findings is ``not_shown``."""
+
+Z_CANDIDATE = 3.5
+"""Evidence below the threshold that makes an effect a candidate: 5e-4, one in a hundred of a library of 26."""
 
 MAX_WITHDRAWN = 6  #: Most causes that are withdrawn one after the other
 
@@ -112,7 +115,7 @@ def diagnose(
     # causes, their values and what they leave
     problem = constancy.with_conditions(prepared, aligned)
     start = aligned if problem is prepared and not seeds else problem.at(simulation.vector)
-    withdrawn: dict[str, verdict.RuledOut] = {}
+    withdrawn: dict[str, verdict.Cause] = {}
     fit = _withdraw_wrong(problem, search(problem, start, seeds), withdrawn)
     varying = constancy.varying_effects(problem, fit)
     varies = {name for effect in varying for name in (effect.name, *effect.rivals)}
@@ -166,29 +169,7 @@ def diagnose(
     inflation = np.array([fit.tests[effect.name].inflation for effect in named for _ in effect.parameters])
     cov = fit.cov[np.ix_(at, at)] * np.sqrt(np.outer(inflation, inflation))
 
-    causes, size = [], float(fit.info.c.sum())
-    for effect in named:
-        test, parameter = fit.tests[effect.name], effect.parameters[0]
-        low, high = test.gain_interval
-        caveat = constancy_of_cause(fit, effect).caveat
-        caveats = [caveat] if caveat else []
-        scatter = constancy.run_scatter(problem, fit, parameter.name)
-        value = float(fit.change[fit.names.index(parameter.name)])
-        if len(effect.parameters) == 1 and scatter > constancy.CAVEAT_RATIO * abs(value):
-            unit = UNITS.get(parameter.unit, parameter.unit)
-            caveats.append(f"it differs from run to run by {scatter:.2g} {unit}".strip())
-        cause = verdict.Cause(
-            name=effect.name,
-            aliases=effect.aliases,
-            parameters=values[effect.name],
-            held_out_gain=float(test.gain.sum()) / size,
-            gain_ci=(low / size, high / size),
-            channels=shown_channels(fit, effect),
-            z=test.z,
-            dispersion=test.dispersion,
-            caveat="; ".join(caveats),
-        )
-        causes.append(cause)
+    causes = [cause_of(problem, fit, effect) for effect in named]
 
     # what could not have been detected beside it, and what is not the answer
     limits, a = [], fit.info.a.sum(axis=0)
@@ -205,7 +186,7 @@ def diagnose(
         for limit in limits
         if limit.detection_limit > EXCITED_RATIO * MOST[limit.name] and limit.name not in parameters
     ]
-    ruled_out = list(withdrawn.values())
+    ruled_out, candidates = [], [*withdrawn.values()]
     answered = {*[effect.name for effect in named], *[name for names in sets for name in names], *withdrawn}
     for effect in effects:
         test = fit.tests[effect.name]
@@ -219,28 +200,30 @@ def diagnose(
             reason = "it is not significant beside what was found"
         else:
             reason = "it does not reduce the residual of runs left out, or differs from run to run"
-        of_cause = values[effect.name] if effect in fit.causes else ()
-        ruled_out.append(verdict.RuledOut(effect.name, reason, test.z, of_cause))
-    verdicts = {
-        Verdict.AMBIGUOUS: sets,
-        Verdict.EXPLAINED: named,
-        Verdict.VARIES: varying,
-        Verdict.UNEXPLAINED: unexplained,
-        Verdict.NOT_EXCITED: len(missed) > BLIND_RATIO * len(limits),
-        Verdict.NONE: True,
+        suggests = test.inside and test.z > Z_CANDIDATE and test.gain_interval[0] > 0
+        if effect in fit.causes or suggests:
+            candidates.append(cause_of(problem, fit, effect, reason))
+        else:
+            ruled_out.append(verdict.RuledOut(effect.name, reason, test.z))
+    tiers = {
+        Tier.NAMED: named,
+        Tier.SET: sets,
+        Tier.CANDIDATE: candidates or varying,
+        Tier.UNEXPLAINED: unexplained,
+        Tier.NOT_SHOWN: len(missed) > BLIND_RATIO * len(limits),
     }
     built_in = problem.simulation.with_effects(dict(zip(parameters, fit.change[at].tolist(), strict=True)))
     after = problem.at(built_in.vector, (), noise=fit.info.noise, scatter=fit.info.scatter)
     return verdict.Diagnosis(
         robot=simulation.robot.name,
-        verdict=next(name for name, holds in verdicts.items() if holds),
+        verdict=next((tier for tier, holds in tiers.items() if holds), None),
         causes=tuple(causes),
         covariance=verdict.Covariance(parameters, cov),
         ambiguous_sets=tuple(sets),
         ambiguous_values={name: values[name] for names in sets for name in names},
         unexplained=unexplained,
         detection_limits=tuple(limits),
-        not_excited=tuple(missed),
+        not_shown=tuple(missed),
         ruled_out=tuple(ruled_out),
         excluded_runs=excluded,
         clocks=clocks_of(aligned, shift),
@@ -251,10 +234,11 @@ def diagnose(
         varying=varying,
         faults=faults,
         by_session=constancy.values_by_session(fit, problem.signals, named, simulation.robot),
+        candidates=tuple(sorted(candidates, key=lambda cause: -cause.z)),
     )
 
 
-def _withdraw_wrong(problem: Problem, fit: CauseFit, withdrawn: dict[str, verdict.RuledOut]) -> CauseFit:
+def _withdraw_wrong(problem: Problem, fit: CauseFit, withdrawn: dict[str, verdict.Cause]) -> CauseFit:
     """Return the causes that may be named; those that were withdrawn are noted by name.
 
     One is withdrawn at a time, the one that gains least, and the others are fitted anew: a wrong cause
@@ -271,7 +255,7 @@ def _withdraw_wrong(problem: Problem, fit: CauseFit, withdrawn: dict[str, verdic
 
 
 def _withdraw_varying(
-    problem: Problem, fit: CauseFit, varies: set[str], withdrawn: dict[str, verdict.RuledOut]
+    problem: Problem, fit: CauseFit, varies: set[str], withdrawn: dict[str, verdict.Cause]
 ) -> CauseFit:
     """Withdraw the causes whose value differs so much from run to run that it is none."""
     for cause in fit.causes:
@@ -286,11 +270,10 @@ def _withdraw_varying(
 
 
 def _withdraw(
-    problem: Problem, fit: CauseFit, cause: Effect, reason: str, withdrawn: dict[str, verdict.RuledOut]
+    problem: Problem, fit: CauseFit, cause: Effect, reason: str, withdrawn: dict[str, verdict.Cause]
 ) -> CauseFit:
     """Note why a cause is withdrawn, and return the others, fitted without it."""
-    z, values = fit.tests[cause.name].z, values_of(fit, cause)
-    withdrawn[cause.name] = verdict.RuledOut(cause.name, reason, z, values)
+    withdrawn[cause.name] = cause_of(problem, fit, cause, reason)
     others = [other for other in fit.causes if other is not cause and other.modifies != cause.name]
     return refit(problem, fit.info, others)
 
@@ -438,6 +421,38 @@ def channel_effects(fit: CauseFit, cause: Effect) -> dict[str, tuple[float, floa
 
 
 # -- What a diagnosis states of what was found ---------------------------------------------------------------
+
+
+def cause_of(problem: Problem, fit: CauseFit, effect: Effect, reason: str = "") -> verdict.Cause:
+    """Return a cause, named or, where a reason speaks against that, a candidate; one not fitted by its linear fit."""
+    test, size, caveats = fit.tests[effect.name], float(fit.info.c.sum()), []
+    if effect in fit.causes:
+        values, parameter = values_of(fit, effect), effect.parameters[0]
+        caveat = constancy_of_cause(fit, effect).caveat
+        caveats = [caveat] if caveat else []
+        scatter = constancy.run_scatter(problem, fit, parameter.name)
+        value = float(fit.change[fit.names.index(parameter.name)])
+        if len(effect.parameters) == 1 and scatter > constancy.CAVEAT_RATIO * abs(value):
+            unit = UNITS.get(parameter.unit, parameter.unit)
+            caveats.append(f"it differs from run to run by {scatter:.2g} {unit}".strip())
+    else:
+        own, base = _own_and_base(fit, effect)
+        free = partial_information(fit.info.a.sum(axis=0), base, own)[1]
+        values = _values(effect, test.change, np.sqrt(np.diag(np.linalg.pinv(free)) * test.inflation))
+    low, high = test.gain_interval
+    return verdict.Cause(
+        name=effect.name,
+        aliases=effect.aliases,
+        parameters=values,
+        held_out_gain=float(test.gain.sum()) / size,
+        gain_ci=(low / size, high / size),
+        channels=shown_channels(fit, effect),
+        z=test.z,
+        dispersion=test.dispersion,
+        caveat="; ".join(caveats),
+        tier=Tier.CANDIDATE if reason else Tier.NAMED,
+        reason=reason,
+    )
 
 
 def values_of(fit: CauseFit, effect: Effect) -> tuple[verdict.Value, ...]:

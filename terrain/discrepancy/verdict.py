@@ -21,20 +21,29 @@ any by chance."""
 INTERVAL_T = 2.36  #: Half a 95 % interval in standard deviations: t with the 7 degrees that eight runs give
 
 
-class Verdict(StrEnum):
-    """Outcome of a diagnosis.
+class Tier(StrEnum):
+    """What a statement of a diagnosis rests on; of a channel, or of a whole diagnosis, the first that holds.
 
-    ``REFUSED`` is never the verdict of a :class:`Diagnosis`: blind trials use it for a diagnosis that ended
-    in a ``DataError``.
+    ========== ===============================================================================================
+    named      One effect: its evidence is above the threshold, nothing else fits as well, and building it in
+               removes, on data held out, a part of the square of the channels where it acts whose interval is
+               above 0, and at least half of what the black-box learner removes there.
+    set        The same of several effects that these runs do not distinguish: one of them is present.
+    candidate  An effect with evidence that did not earn a name: below the threshold, not confirmed on data
+               held out, withdrawn for the reason given, or without one value for all runs.  It is not built in.
+    unexplained  Measured and simulated differ systematically, and no effect is named for it.
+    not_shown  Nothing was found, and these drives could not have shown all that may be wrong: some effects, at
+               the largest that they may be, would have stayed undetected.
+    ========== ===============================================================================================
+
+    Where nothing was found and these drives would have shown it there is none: measured and simulated agree.
     """
 
-    NONE = "none"
-    EXPLAINED = "explained"
-    AMBIGUOUS = "ambiguous"
+    NAMED = "named"
+    SET = "set"
+    CANDIDATE = "candidate"
     UNEXPLAINED = "unexplained"
-    VARIES = "varies"
-    NOT_EXCITED = "not_excited"
-    REFUSED = "refused"
+    NOT_SHOWN = "not_shown"
 
 
 class Value(NamedTuple):
@@ -52,7 +61,7 @@ class Value(NamedTuple):
 
 
 class Cause(NamedTuple):
-    """An effect that the measured runs have and the simulation lacks."""
+    """An effect that the measured runs have and the simulation lacks, or a candidate for one."""
 
     name: str
     aliases: tuple[str, ...]
@@ -64,6 +73,8 @@ class Cause(NamedTuple):
     z: float  #: its evidence, see :class:`terrain.discrepancy.evidence.WaldTest`
     dispersion: float  #: as there
     caveat: str = ""  #: what the values depend on, in words; empty where they are the same throughout
+    tier: Tier = Tier.NAMED  #: named or candidate
+    reason: str = ""  #: why it is no more than a candidate; empty where it is named
 
 
 class RunGroup(NamedTuple):
@@ -131,12 +142,11 @@ class Limit(NamedTuple):
 
 
 class RuledOut(NamedTuple):
-    """An effect that is not the answer: why, its evidence, and the values of one that was withdrawn."""
+    """An effect that is not the answer: why, and its evidence."""
 
     name: str
     reason: str
     z: float
-    parameters: tuple[Value, ...] = ()
 
 
 class Residual(NamedTuple):
@@ -145,6 +155,24 @@ class Residual(NamedTuple):
     rms: float  #: of measured minus simulated
     noise: float  #: of what is left when all parameters of the library are freed
     systematic: float  #: part of the square that is not noise, from 0 to 1
+
+
+class ChannelVerdict(NamedTuple):
+    """What is off in one channel, what explains it, and what that removes on data held out.
+
+    Root mean squares are of measured minus simulated behind the common low-pass, in the channel's unit.  Gains are
+    parts of the square that are removed, with 95 % intervals; NaN where nothing was built in, or not measured.
+    """
+
+    channel: str
+    tier: Tier | None  #: None where measured and simulated agree
+    causes: tuple[str, ...]  #: effects built in that act on it
+    rms_before: float
+    rms_after: float
+    gain: float  #: by what was built in
+    gain_ci: tuple[float, float]
+    learner_gain: float  #: by the black-box learner, on the same data
+    learner_ci: tuple[float, float]
 
 
 class NextDrive(NamedTuple):
@@ -169,22 +197,18 @@ class Covariance(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Diagnosis:
-    """What :func:`terrain.discrepancy.diagnose.diagnose` states.
-
-    The verdict is ``explained`` where a cause is named, also when something else is left unexplained, and
-    ``varies`` where what was found has no value that all runs share.
-    """
+    """What :func:`terrain.discrepancy.diagnose.diagnose` states; ``verdict`` is the first tier that holds."""
 
     robot: str
-    verdict: Verdict
-    causes: tuple[Cause, ...]
+    verdict: Tier | None
+    causes: tuple[Cause, ...]  #: that are named
     covariance: Covariance  #: of the causes' parameters
     ambiguous_sets: tuple[tuple[str, ...], ...]
     """Effects of which one is present, not distinguished; best fit first."""
     ambiguous_values: dict[str, tuple[Value, ...]]  #: fitted values of each of them, by the effect's name
     unexplained: tuple[Unexplained, ...]
     detection_limits: tuple[Limit, ...]  #: of every effect
-    not_excited: tuple[Limit, ...]  #: those beyond what an effect may be
+    not_shown: tuple[Limit, ...]  #: those beyond what an effect may be
     ruled_out: tuple[RuledOut, ...]
     excluded_runs: tuple[Excluded, ...]
     clocks: tuple[Clock, ...]
@@ -195,6 +219,8 @@ class Diagnosis:
     varying: tuple[Varying, ...] = ()
     faults: tuple[Fault, ...] = ()  #: of channels, which were repaired before anything was compared
     by_session: tuple[BySession, ...] = ()  #: values of the named causes; empty where runs are of one session
+    candidates: tuple[Cause, ...] = ()  #: the strongest evidence first
+    channels: tuple[ChannelVerdict, ...] = ()  #: by channel, once the gain was measured
 
     @property
     def values(self) -> dict[str, float]:

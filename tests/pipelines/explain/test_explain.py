@@ -74,7 +74,7 @@ def test_the_hidden_cause_is_named_built_in_and_absent_when_tested_again(terrain
     code, out, err = terrain(*here, "again", *words, "--json", "again.json")
     assert code == 0, err
     again = json.loads((place / "again.json").read_text())
-    assert (again["verdict"], again["causes"]) == ("none", [])
+    assert (again["verdict"], again["causes"]) == (None, [])
     assert again["effects"] == ["gyro_scale", "camera_yaw", "lever_arm"]
     assert not (place / "again" / EXTENDED_FILE).exists()
     assert "not measured: no cause was named" in out

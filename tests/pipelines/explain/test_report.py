@@ -47,7 +47,7 @@ def explained(few):
             "robot": "a<b>",
             "causes": (),
             "detection_limits": LIMITS,
-            "not_excited": (),
+            "not_shown": (),
             "next_drive": None,
         }
         empty["ruled_out"] = (verdict.RuledOut("scrub", "the runs show nothing of it", 0.44),)
@@ -121,7 +121,7 @@ LEFT = (
             ),
         ),
         (
-            {"not_excited": LIMITS[1:3], "unexplained": LEFT, "varying": (PAYLOAD,)},
+            {"not_shown": LIMITS[1:3], "unexplained": LEFT, "varying": (PAYLOAD,)},
             (
                 "depends on wheel 1 turn 12.3 20.0 %",
                 "Of 4 parameters that may be wrong, 2 could not have been detected.",

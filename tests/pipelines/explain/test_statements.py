@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.explain.statements import notes_of, split_ruled_out, statements_of
+from pipelines.explain.statements import notes_of, statements_of, would_have_shown
 from terrain.discrepancy.compared import (
     ComparedRun,
     Slope,
@@ -24,10 +24,10 @@ from terrain.discrepancy.verdict import (
     Diagnosis,
     Limit,
     RuledOut,
+    Tier,
     Unexplained,
     Value,
     Varying,
-    Verdict,
 )
 from terrain.effects import CHANNELS
 from terrain.robots import load_robot
@@ -58,10 +58,10 @@ def runs_of(n, *options, **more):
 
 
 def a_diagnosis(**more):
-    none = ("causes", "ambiguous_sets", "unexplained", "detection_limits", "not_excited", "ruled_out")
+    none = ("causes", "ambiguous_sets", "unexplained", "detection_limits", "not_shown", "ruled_out")
     empty = dict.fromkeys((*none, "excluded_runs", "clocks"), ())
     empty |= {name: {} for name in ("ambiguous_values", "residual_before", "residual_after")}
-    empty |= {"robot": "husky", "verdict": Verdict.NONE, "next_drive": None, "n_runs": 8}
+    empty |= {"robot": "husky", "verdict": None, "next_drive": None, "n_runs": 8}
     return Diagnosis(**(empty | {"covariance": Covariance((), np.empty((0, 0)))} | more))
 
 
@@ -102,7 +102,8 @@ def test_a_channel_states_factor_cause_in_the_robots_quantities_and_its_error_on
     assert "from 0.43 to 0.02 rad/s on the runs compared" in sentence(runs, causes=(TRACK,))
 
 
-LATE = RuledOut("clock_offset", "why", 9.0, (Value("clock_offset_s", -0.27, "s", -0.28, -0.26),))
+LATE_VALUE = Value("clock_offset_s", -0.27, "s", -0.28, -0.26)
+LATE = TRACK._replace(name="clock_offset", parameters=(LATE_VALUE,), tier=Tier.CANDIDATE, reason="why")
 RIVALS = {
     "payload": (Value("payload_ratio", 0.2, "ratio", 0.1, 0.3),),
     "motor_constant": (Value("motor_constant_ratio", 0.25, "ratio", 0.2, 0.3),),
@@ -119,8 +120,8 @@ RIVALS = {
         ),
         (
             [a_run(1, std=0.2)],
-            {"unexplained": (Unexplained(YAW, "clock_offset", 9.0, 0.0),), "ruled_out": (LATE,)},
-            "apart, which looks like the wheels logged 0.27 s late, a cause that was withdrawn.",
+            {"unexplained": (Unexplained(YAW, "clock_offset", 9.0, 0.0),), "candidates": (LATE,)},
+            "apart, which looks like the wheels logged 0.27 s late, a candidate that did not earn its name.",
         ),
         (
             runs_of(4),
@@ -206,6 +207,6 @@ def test_terrains_that_differ_or_are_bumpy_are_named_where_runs_differ_only():
 
 def test_what_could_not_have_been_seen_is_not_ruled_out():
     missed = Limit("payload_ratio", np.inf, "ratio", "slopes")
-    effects = (LATE, RuledOut("payload", "no", 0.0), RuledOut("gyro_bias", "no", 0.0))
-    withdrawn, seen = split_ruled_out(a_diagnosis(ruled_out=effects, not_excited=(missed,)))
-    assert [effect.name for effect in (*withdrawn, *seen)] == ["clock_offset", "gyro_bias"]
+    effects = (RuledOut("payload", "no", 0.0), RuledOut("gyro_bias", "no", 0.0))
+    seen = would_have_shown(a_diagnosis(ruled_out=effects, not_shown=(missed,)))
+    assert [effect.name for effect in seen] == ["gyro_bias"]

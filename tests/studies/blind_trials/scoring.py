@@ -10,7 +10,7 @@ import numpy as np
 
 from studies.blind_trials.trial import DRIVE_ROWS, FAULTS, KNOWN, OUTSIDE, ROBOTS, Row, Trial, value_is_right
 from terrain.bootstrap import proportion_interval
-from terrain.discrepancy.verdict import Verdict
+from terrain.discrepancy.verdict import Tier
 from terrain.effects import library_of
 from terrain.records import Array
 
@@ -87,8 +87,8 @@ def _plain_scores(rows: Mapping[Row, Sequence[Trial]]) -> Iterator[tuple[str, Sc
     poor = rows[Row.POOR]
     wrong = (bool(set(t.named) - set(t.causes)) for t in poor)
     yield "poor: a wrong single name", score(wrong, most=0.02)
-    undecided = (Verdict.AMBIGUOUS, Verdict.NOT_EXCITED)
-    yield "poor: ambiguous or not excited", score(t.verdict in undecided for t in poor)
+    undecided = (bool(t.sets) or t.verdict in (Tier.CANDIDATE, Tier.NOT_SHOWN) for t in poor)
+    yield "poor: a set, a candidate or not shown", score(undecided)
 
 
 def _measured_scores(rows: Mapping[Row, Sequence[Trial]]) -> Iterator[tuple[str, Score]]:
@@ -172,9 +172,9 @@ def varies(trial: Trial, cause: str) -> bool:
 
 
 def states_something(trial: Trial) -> bool:
-    """Return whether an answer states that something is wrong."""
-    quiet = trial.verdict in (Verdict.NONE, Verdict.NOT_EXCITED)
-    return not quiet or bool(trial.statements or trial.varying)
+    """Return whether an answer states that something is wrong; a candidate alone is no statement."""
+    states = trial.named, trial.sets, trial.unexplained, trial.varying, trial.statements, trial.refusal
+    return any(map(bool, states))
 
 
 def is_covered(trial: Trial) -> bool:

@@ -21,7 +21,7 @@ from studies.blind_trials.trial import (
     run_trial,
 )
 from terrain.discrepancy.health.fault import Column, FaultKind
-from terrain.discrepancy.verdict import Clock, RunGroup, Value, Verdict
+from terrain.discrepancy.verdict import Clock, RunGroup, Tier, Value
 
 RIGHT = Trial(
     row=Row.SHORT,
@@ -34,18 +34,18 @@ RIGHT = Trial(
     over_limit=5.0,
     classes={"payload": ("motor_constant", "payload")},
     seconds=0.3,
-    verdict=Verdict.EXPLAINED,
+    verdict=Tier.NAMED,
     named=("payload",),
     intervals={"payload_ratio": (0.2, 0.1, 0.3)},
     gain_low=0.1,
 )
 OFF = {"payload_ratio": (0.4, 0.3, 0.5)}
-SILENT = replace(RIGHT, named=(), verdict=Verdict.NONE, intervals={}, gain_low=math.nan)
+SILENT = replace(RIGHT, named=(), verdict=None, intervals={}, gain_low=math.nan)
 QUIET = replace(SILENT, row=Row.NONE, hidden={}, causes=(), over_limit=0.0)
 WRONG = replace(RIGHT, named=("scrub",), intervals={"scrub_ratio": (0.1, 0.0, 0.2)}, gain_low=-0.1)
 BESIDE = replace(RIGHT, named=("payload", "scrub"))
-TWINS = replace(SILENT, verdict=Verdict.AMBIGUOUS, sets=(("payload", "motor_constant"),))
-REFUSED = replace(SILENT, verdict=Verdict.REFUSED, refusal="runs: only 2 of 8 are fit")
+TWINS = replace(SILENT, verdict=Tier.SET, sets=(("payload", "motor_constant"),))
+REFUSED = replace(SILENT, refusal="runs: only 2 of 8 are fit")
 
 
 @pytest.mark.parametrize(("k", "n"), [(0, 300), (1, 100), (3, 7), (97, 100), (20, 20)])
@@ -118,11 +118,12 @@ DEG = replace(FAULT, statements=(Statement("unit", "gyro", "the gyro is in deg/s
         (replace(FAULT, named=(TRACK,)), False, True),
         # the dynamic simulation with nothing hidden asks for silence
         (DYNAMIC, True, False),
-        (replace(DYNAMIC, verdict=Verdict.NOT_EXCITED), True, False),
-        (replace(DYNAMIC, verdict=Verdict.UNEXPLAINED), False, False),
+        (replace(DYNAMIC, verdict=Tier.NOT_SHOWN), True, False),
+        (replace(DYNAMIC, verdict=Tier.CANDIDATE), True, False),
+        (replace(DYNAMIC, verdict=Tier.UNEXPLAINED, unexplained=(("current_a", "time"),)), False, False),
         (replace(DYNAMIC, statements=(Statement("stuck", "gyro", "it is frozen"),)), False, False),
         (replace(DYNAMIC, varying=(Varying("payload", ()),)), False, True),
-        (replace(DYNAMIC, verdict=Verdict.REFUSED), False, False),
+        (replace(DYNAMIC, refusal="too few"), False, False),
     ],
 )
 def test_each_row_has_a_right_answer_of_its_own(trial, right, wrong):
@@ -152,14 +153,14 @@ TRIALS = [
     *(STALLED, replace(STALLED, excluded=("run_02", "run_07"))),
     *(VARIES, replace(VARIES, present=("a", "c")), HALF),
     *(DEG, FAULT, replace(FAULT, named=(TRACK,))),
-    *([DYNAMIC] * 57 + [replace(DYNAMIC, verdict=Verdict.REFUSED)] * 3),
+    *([DYNAMIC] * 57 + [replace(DYNAMIC, refusal="too few")] * 3),
     *[of(Row.DYNAMIC, t) for t in (RIGHT, replace(RIGHT, intervals=OFF), TWINS, SILENT)],
     *(
         KNOWN,
         replace(KNOWN, intervals={TRACK_RATIO: (1.7, 1.4, 2.0)}),
         replace(KNOWN, named=(TRACK, "scrub")),
     ),
-    *([QUIET] * 99 + [replace(QUIET, verdict=Verdict.UNEXPLAINED)]),
+    *([QUIET] * 99 + [replace(QUIET, verdict=Tier.UNEXPLAINED, unexplained=(("current_a", "time"),))]),
     *([of(Row.STRONG)] * 96 + [of(Row.STRONG, intervals=OFF), of(Row.STRONG, WRONG)]),
     *([of(Row.LADDER, over_limit=0.5)] + [of(Row.LADDER)] * 2),
     of(Row.OUTSIDE, QUIET, outside=OUTSIDE[0], named=("wheel_radius",)),
@@ -200,7 +201,7 @@ COUNTS = {
     f"outside, {OUTSIDE[1]}: misnamed": None,
     f"outside, {OUTSIDE[2]}: unexplained": (1, 1, True),
     "poor: a wrong single name": (0, 1, True),
-    "poor: ambiguous or not excited": (1, 1, True),
+    "poor: a set, a candidate or not shown": (1, 1, True),
 }
 
 
@@ -225,7 +226,7 @@ def test_a_trial_takes_what_the_diagnosis_answers(monkeypatch):
         causes=(),
         ambiguous_sets=(("payload", "motor_constant"),),
         ambiguous_values={"motor_constant": (value,)},
-        verdict=Verdict.AMBIGUOUS,
+        verdict=Tier.SET,
         unexplained=(),
         clocks=(Clock("a", -0.2, 0.01), Clock("b", math.nan, math.nan), Clock("c", -0.3, 0.01)),
         excluded_runs=(SimpleNamespace(run_id="b"),),

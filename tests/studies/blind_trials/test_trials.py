@@ -47,7 +47,7 @@ from studies.blind_trials.trial import (
 )
 from terrain.discrepancy.diagnose import POWER_Z, diagnose
 from terrain.discrepancy.evidence import Z_EFFECT
-from terrain.discrepancy.verdict import Verdict
+from terrain.discrepancy.verdict import Tier
 from terrain.effects import BOUNDS, effect_named, library_of
 from terrain.errors import DataError
 from terrain.robots import load_robot
@@ -382,7 +382,7 @@ def test_short_runs_in_which_nothing_is_hidden_have_no_cause():
     drives = command_drives(np.random.default_rng(0), HUSKY, 16)
     runs = hidden_runs(HUSKY, drives, np.random.SeedSequence(0), {}, heading=True)
     answer = diagnose(tuple(map(as_command_log, runs)), simulation_of(HUSKY))
-    assert answer.verdict in (Verdict.NONE, Verdict.NOT_EXCITED)
+    assert answer.verdict in (None, Tier.NOT_SHOWN, Tier.CANDIDATE)
     assert (answer.causes, answer.ambiguous_sets, answer.varying, answer.faults) == ((), (), (), ())
     assert len(answer.excluded_runs) <= 1  # a command may leave a wheel as fast as the one before
 
@@ -423,7 +423,7 @@ def test_refused_runs_count_as_a_false_alarm(monkeypatch):
 
     monkeypatch.setattr("studies.blind_trials.trial.diagnose", refuse)
     trial = run_trial(cases_of(Row.NONE, 1, 0, 3)[0])
-    assert (trial.verdict, trial.named, trial.right) == (Verdict.REFUSED, (), True)
+    assert (trial.verdict, trial.named, trial.right) == (None, (), True)
     assert table_of([trial])["none: false alarms"].hits == 1
 
 

@@ -29,7 +29,7 @@ from terrain.discrepancy.diagnosed_runs import simulation_for
 from terrain.discrepancy.health.fault import Column, FaultKind
 from terrain.discrepancy.held_out import split_runs
 from terrain.discrepancy.runs import Simulation
-from terrain.discrepancy.verdict import Verdict
+from terrain.discrepancy.verdict import Tier
 from terrain.effects import (
     ACCEL,
     BOTH,
@@ -518,9 +518,8 @@ class Trial:
     present: tuple[str, ...] = ()  #: ids of those that have the effect if only some do
     fault: str = ""  #: name of the one written into the logs
     # -- the answer
-    verdict: Verdict = Verdict.REFUSED
-    """By default where the runs were not accepted, as too few seemed to be fit."""
-    refusal: str = ""  #: why they were refused
+    verdict: Tier | None = None
+    refusal: str = ""  #: why the runs were not accepted, as too few seemed to be fit
     named: tuple[str, ...] = ()
     sets: tuple[tuple[str, ...], ...] = ()
     unexplained: tuple[tuple[str, str], ...] = ()

@@ -23,7 +23,7 @@ from terrain.discrepancy.constancy import (
 )
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.evidence import Evidence, grams_of
-from terrain.discrepancy.verdict import Verdict
+from terrain.discrepancy.verdict import Tier
 from terrain.effects import PARAMETERS, effect_named
 from terrain.robots import load_robot
 
@@ -212,7 +212,7 @@ def test_half_of_the_runs_are_a_group_and_that_is_the_answer(runs):
     half = runs(0.06 * ODD)
     diagnosis = diagnose(half, SIMULATION, tuple(map(effect_named, MIXED)))
     # no value of all runs is named
-    assert (diagnosis.verdict, diagnosis.causes, diagnosis.ambiguous_sets) == (Verdict.VARIES, (), ())
+    assert (diagnosis.verdict, diagnosis.causes, diagnosis.ambiguous_sets) == (Tier.CANDIDATE, (), ())
     (effect,) = diagnosis.varying
     assert (effect.name, effect.rivals, effect.channel) == ("wheel_radius", (), "speed_x_mps")
     assert effect.mean == pytest.approx(0.03, abs=0.005)
@@ -286,8 +286,8 @@ def test_loads_that_differ_explain_a_mean_of_their_scatter_times_root_three(runs
     assert error_of(runs(SAME, PAYLOAD), 0.3) < 0.1  # one load in all runs is no condition that differs
     # they are news only to a simulation that knows of none
     library = tuple(map(effect_named, FEW))
-    assert diagnose(spread, LOADED, library).verdict in (Verdict.NONE, Verdict.NOT_EXCITED)
-    assert diagnose(spread, SIMULATION, library).verdict not in (Verdict.NONE, Verdict.NOT_EXCITED)
+    assert diagnose(spread, LOADED, library).verdict in (None, Tier.NOT_SHOWN)
+    assert diagnose(spread, SIMULATION, library).verdict not in (None, Tier.NOT_SHOWN)
 
 
 # -- The likelihood of runs whose parameters vary, by two routes, and its maximum ----------------------------

@@ -13,7 +13,7 @@ from studies.blind_trials.trial import hidden_runs, simulation_of
 import terrain.discrepancy.diagnose as diagnose_module
 from pipelines.report.results import as_json
 from terrain.discrepancy.diagnose import MIN_RUNS, diagnose
-from terrain.discrepancy.verdict import Verdict
+from terrain.discrepancy.verdict import Tier
 from terrain.effects import CURRENT, GYRO, HEADING, effect_named
 from terrain.errors import DataError
 from terrain.records import Stream
@@ -109,7 +109,7 @@ def test_where_nothing_is_hidden_nothing_is_named(worlds, name):
         assert CURRENT not in diagnosis.residual_before
         return
     # so short runs do not excite all that a Husky may lack
-    assert diagnosis.verdict == (Verdict.NONE if name == "agrimaro" else Verdict.NOT_EXCITED)
+    assert diagnosis.verdict == (None if name == "agrimaro" else Tier.NOT_SHOWN)
     assert diagnosis.unexplained == ()
     assert {limit.name for limit in diagnosis.detection_limits} >= {"payload_ratio", "gyro_bias_radps"}
     # what is apart is noise, and what scatters from run to run: biases of the gyro
@@ -132,7 +132,7 @@ def test_what_is_hidden_is_named_with_its_value_and_nothing_beside_it(worlds, ro
         assert effect in diagnosis.ambiguous_sets[0]
         assert set(diagnosis.ambiguous_sets[0]) <= world.twins(effect)
         return
-    assert diagnosis.verdict == Verdict.EXPLAINED
+    assert diagnosis.verdict == Tier.NAMED
     assert are_right(diagnosis, hidden)
     assert diagnosis.causes[0].gain_ci[0] > 0
     before, after = (
@@ -174,15 +174,15 @@ def test_two_effects_are_named_beside_a_run_that_is_unfit_and_half_of_one_where_
 def test_an_effect_of_no_library_or_without_its_entry_is_unexplained(worlds):
     world = worlds("husky")
     diagnosis = diagnose(world.runs({}, {"wheel_eccentricity_ratio": 0.03}), world.simulation)
-    assert (diagnosis.verdict, named(diagnosis)) == (Verdict.UNEXPLAINED, [])
+    assert (diagnosis.verdict, named(diagnosis)) == (Tier.UNEXPLAINED, [])
     assert any("wheel" in left.input for left in diagnosis.unexplained)
     few = ("motor_constant", "payload", "current_offset", "wheel_radius", "scrub", "viscous_drag")
     library = [effect_named(name) for name in few]
     diagnosis = diagnose(world.runs(world.hidden("motor_drift", over=8.0)), world.simulation, library)
-    assert (diagnosis.verdict, named(diagnosis)) == (Verdict.UNEXPLAINED, [])
+    assert (diagnosis.verdict, named(diagnosis)) == (Tier.CANDIDATE, [])
     assert any(left.channel == "current_a" for left in diagnosis.unexplained)
     # what resembles it most grows along a run: it is withdrawn with its values
-    (withdrawn,) = [effect for effect in diagnosis.ruled_out if "depends on time" in effect.reason]
+    (withdrawn,) = [each for each in diagnosis.candidates if "depends on time" in each.reason]
     assert withdrawn.name == "motor_constant"
     assert len(withdrawn.parameters) == 1
 
@@ -195,7 +195,7 @@ def test_exact_twins_are_ambiguous_and_the_channel_that_distinguishes_them_is_na
         speeds = Stream(wheels.time_s, wheels.values[:, :2], wheels.channels[:2])
         runs.append(replace(run, streams={"wheels": speeds, "imu": run.streams["imu"]}))
     diagnosis = diagnose(runs, world.simulation)
-    assert (diagnosis.verdict, named(diagnosis)) == (Verdict.AMBIGUOUS, [])
+    assert (diagnosis.verdict, named(diagnosis)) == (Tier.SET, [])
     assert {"gyro_scale", "effective_track"} <= set(diagnosis.ambiguous_sets[0])
     values = {v.name: v.value for values in diagnosis.ambiguous_values.values() for v in values}
     assert values["gyro_scale_ratio"] == pytest.approx(0.1, abs=0.01)

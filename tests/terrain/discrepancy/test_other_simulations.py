@@ -11,7 +11,7 @@ from terrain.discrepancy.health.readings import candidate_changes
 from terrain.discrepancy.powertrain import traces_of
 from terrain.discrepancy.robot_terms import in_robot_terms, value_in_robot_terms
 from terrain.discrepancy.runs import signals_of
-from terrain.discrepancy.verdict import Value, Verdict
+from terrain.discrepancy.verdict import Tier, Value
 from terrain.effects import CHANNELS, effect_named, library_of, vector_of
 from terrain.errors import DataError
 from terrain.estimation.estimate import enriched, estimate_run
@@ -111,7 +111,7 @@ def test_an_effect_hidden_in_the_plant_is_named_and_nothing_else(effects, option
     assert diagnosis.values == {name: pytest.approx(value, rel=0.15) for name, value in effects.items()}
     assert (diagnosis.ambiguous_sets, diagnosis.excluded_runs, diagnosis.faults) == ((), (), ())
     if not effects:
-        assert diagnosis.verdict in (Verdict.NONE, Verdict.NOT_EXCITED)
+        assert diagnosis.verdict in (None, Tier.NOT_SHOWN)
 
 
 def test_a_run_is_simulated_on_the_soil_of_its_label_or_the_default_terrain():
