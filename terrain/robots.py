@@ -285,6 +285,8 @@ class Wheel(NamedTuple):
     direction_rad: float = 0.0  #: that it drives along where it is not steered; 0 is ahead
     is_steered: bool = False  #: steered wheels are the first ones of a robot
     rolls_across: bool = False  #: as an omni wheel, whose rollers turn with it
+    #: of such a wheel, from the direction that it drives along to the axis of its rollers: 0 of an omni wheel
+    roller_rad: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -353,6 +355,8 @@ class Robot(ABC):
     wheel_positions_m: Array = field(init=False, repr=False, compare=False)
     #: direction (wheels,) that each wheel drives along where it is not steered; 0 is ahead
     wheel_directions_rad: Array = field(init=False, repr=False, compare=False)
+    #: angle (wheels,) from there to the axis of its rollers, along which alone the ground holds it; 0 without
+    roller_angles_rad: Array = field(init=False, repr=False, compare=False)
 
     #: numbers that every description of the drive has, beside its sections
     numbers: ClassVar[tuple[str, ...]] = ("wheel_radius_m", "track_m", "wheelbase_m", "mass_kg")
@@ -376,7 +380,8 @@ class Robot(ABC):
         follows: dict[str, Any] = {"effects_cov": read_only(cov), **self.parts}
         for name in ("parts", "effects", "identified"):
             follows[name] = MappingProxyType(dict(getattr(self, name)))
-        names, x_m, y_m, channels, directions, steered, across = zip(*self.wheel_table(), strict=True)
+        table = self.wheel_table()
+        names, x_m, y_m, channels, directions, steered, across, rollers = zip(*table, strict=True)
         by_motor = any(channel.startswith("motor_") for channel in channels)
         logged = tuple(name for name, channel in zip(names, channels, strict=True) if channel)
         turning = tuple(name for name, is_steered in zip(names, steered, strict=True) if is_steered)
@@ -394,6 +399,7 @@ class Robot(ABC):
             "sideways": all(np.logical_or(across, steered)),
             "wheel_positions_m": read_only(np.column_stack([x_m, y_m])),
             "wheel_directions_rad": read_only(directions),
+            "roller_angles_rad": read_only(rollers),
         }
         for name, value in follows.items():
             object.__setattr__(self, name, value)
@@ -657,6 +663,51 @@ class OmniRobot(Robot):
 
 
 @dataclass(frozen=True)
+class MecanumRobot(Robot):
+    """Four mecanum wheels that drive ahead; their rollers' axes cross in an X, seen from above.
+
+    Each pulls along the axis of its roller on the ground, at ``roller_rad`` from ahead: to the right in front on the
+    left and behind on the right, to the left on the others.  Of the half lengths of the rectangle of the wheels only
+    the sum acts (Muir and Neuman, Kinematic modeling for feedback control of an omnidirectional wheeled mobile robot,
+    ICRA 1987), at 45 degrees; :attr:`wheel_distance_m` is that sum.
+
+    Examples
+    --------
+    >>> robot = MecanumRobot("cart", 0.05, 0.3, 0.4, 20.0)
+    >>> robot.rate_channels[:2], robot.wheel_distance_m, robot.sideways
+    (('speed_front_left_mps', 'speed_front_right_mps'), 0.35, True)
+    """
+
+    roller_rad: float = math.pi / 4
+
+    numbers: ClassVar[tuple[str, ...]] = (*Robot.numbers, "roller_rad")
+    drive: ClassVar[str] = "mecanum"
+    n_tyres: ClassVar[int] = 4
+
+    @property
+    def wheel_distance_m(self) -> float:
+        """Speed of a wheel over the yaw rate of turning in place."""
+        return (self.wheelbase_m * math.tan(self.roller_rad) + self.track_m) / 2.0
+
+    def wheel_table(self) -> tuple[Wheel, ...]:
+        """Return the four wheels."""
+        half_m, side_m, wheels = self.wheelbase_m / 2, self.track_m / 2, []
+        for end, x_m in (("front", half_m), ("rear", -half_m)):
+            for side, y_m in (("left", side_m), ("right", -side_m)):
+                roller_rad = -math.copysign(self.roller_rad, x_m * y_m)
+                name = f"{end}_{side}"
+                about = f"speed_{name}_mps", 0.0, False, True, roller_rad
+                wheels.append(Wheel(name, x_m, y_m, *about))
+        return tuple(wheels)
+
+    def check_geometry(self, place: str) -> None:
+        """Refuse dimensions that no body can have, and rollers that do not turn across or along."""
+        super().check_geometry(place)
+        if not 0.0 < self.roller_rad < np.pi / 2:
+            raise ConfigError(f"{place}: roller_rad is {self.roller_rad:g}, between 0 and pi/2 is required")
+
+
+@dataclass(frozen=True)
 class BicycleRobot(Robot):
     """A car-like robot; its body's origin is the middle of the rear axle, as in Deremetz et al.
 
@@ -687,11 +738,14 @@ class BicycleRobot(Robot):
     drive: ClassVar[str] = "bicycle"
     sections: ClassVar[tuple[str, ...]] = ("sensors",)
     n_tyres: ClassVar[int] = 4
+    #: whether the front wheel drives, and the speed that is logged is its own
+    front_driven: ClassVar[bool] = False
 
     def wheel_table(self) -> tuple[Wheel, ...]:
         """Return front and rear wheel; the rear axle is the body's origin."""
-        front = Wheel("front", self.wheelbase_m, 0.0, is_steered=True)
-        return front, Wheel("rear", 0.0, 0.0, "speed_rear_mps")
+        logged = ("speed_front_mps", "") if self.front_driven else ("", "speed_rear_mps")
+        front = Wheel("front", self.wheelbase_m, 0.0, logged[0], is_steered=True)
+        return front, Wheel("rear", 0.0, 0.0, logged[1])
 
     @property
     def com_behind_front_m(self) -> float:
@@ -724,6 +778,23 @@ class BicycleRobot(Robot):
             )
 
 
+@dataclass(frozen=True)
+class TricycleRobot(BicycleRobot):
+    """A car-like robot whose front wheel is steered and driven; ``wheel_radius_m`` is that wheel's.
+
+    With its speed u and its angle d the rear axle moves ahead by ``u cos d``, and the body turns by ``u sin d / L``.
+
+    Examples
+    --------
+    >>> TricycleRobot("truck", 0.1, 1.0, 1.4, 200.0).rate_channels
+    ('speed_front_mps',)
+    """
+
+    drive: ClassVar[str] = "tricycle"
+    n_tyres: ClassVar[int] = 3
+    front_driven: ClassVar[bool] = True
+
+
 _R = TypeVar("_R", bound=Robot)
 
 
@@ -750,7 +821,10 @@ def as_drive(kind: type[_R], robot: Robot, refusal: str) -> _R:
 
 #: The type of each drive.
 KIND_OF_DRIVE: dict[str, type[Robot]] = {
-    kind.drive: kind for kind in (SkidSteerRobot, TrackedRobot, SwerveRobot, OmniRobot, BicycleRobot)
+    kind.drive: kind
+    for kind in (
+        *(SkidSteerRobot, TrackedRobot, SwerveRobot, OmniRobot, MecanumRobot, BicycleRobot, TricycleRobot),
+    )
 }
 
 #: Numbers of the section ``identified``, which logs of one robot showed and no nominal figure is: the least

@@ -33,7 +33,9 @@ FILTERS_OF_DRIVE: Mapping[str, tuple[str, ...]] = {
     "skid_steer": ("skid",),
     "tracked": ("skid",),
     "omni": (),
+    "mecanum": (),
     "bicycle": (),
+    "tricycle": (),
 }
 #: Noise in natural units; the thesis' own (6.13), (6.14), with its smoothing and without gates; process noise fitted
 #: to chosen runs.

@@ -21,7 +21,7 @@ import numpy as np
 from numba import types
 
 from terrain.kernels import njit
-from terrain.kinematics.wheels import point_velocity, velocity_matrix, wheel_frame_velocities
+from terrain.kinematics.wheels import point_velocity, rolling_matrix, velocity_matrix
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot
 
@@ -86,7 +86,8 @@ def wheel_motion(robot: Robot, twist: Array, dt_s: float) -> WheelMotion:
             robot.wheel_positions_m, radius_m, *limits, np.asarray(twist, float), np.zeros(len(robot.wheels))
         )
         return WheelMotion(admitted, wheel_radps * radius_m, wheel_radps, steers)
-    speeds, _ = wheel_frame_velocities(twist, robot.wheel_positions_m, robot.wheel_directions_rad)
+    place = robot.wheel_positions_m, robot.wheel_directions_rad, robot.roller_angles_rad
+    speeds = twist @ rolling_matrix(*place).T
     limit = radius_m * robot.completed.motors.speed_max_radps
     if robot.sideways:
         over = np.maximum(np.abs(speeds).max(axis=1, keepdims=True) / limit, 1.0)

@@ -7,6 +7,10 @@ along ``d_i``, all in body axes, the angle of its steering or that of an omni wh
     along the wheel           p_ix' cos d_i + p_iy' sin d_i
     across it, to the left    p_iy' cos d_i - p_ix' sin d_i
 
+The ground holds a wheel with rollers along the axis of the one that touches it alone, at an angle g_i from d_i; with
+the velocity along that axis a wheel that rolls there has ``u_i cos g_i = p_ix' cos(d_i + g_i) + p_iy' sin(d_i + g_i)``:
+an omni wheel's g_i is 0, a mecanum wheel's usually 45 degrees to a side.
+
 Where a wheel rolls without slip, the first is its circumferential speed u_i, which for all of them is ``u = J V``;
 the second is 0, but of an omni wheel, whose rollers turn with it.  The twist of wheels that contradict each other is
 that of least squares over all these rows, which for wheels that do not roll across is ``V = H^+ S(d) u`` (2.3, 2.4).
@@ -17,7 +21,7 @@ Sources: Danzi, AgriMaRo thesis, 2.3 and (7.3)-(7.5).  Corrected: it puts the ya
 H are reordered accordingly; one table of wheel positions, ``robot.wheel_positions_m`` (its 7.2), because (2.3)
 numbers the wheels of the x axis in the opposite order; rows of H are ``[-y_i 1 0; x_i 0 1]``; S is block-diagonal,
 6 x 3.  Omni wheels: Siegwart, Nourbakhsh, Scaramuzza, Introduction to Autonomous Mobile Robots, 3.2.3: the Swedish
-wheel with rollers at a right angle.
+wheel with rollers at a right angle, and at any other.
 """
 
 from __future__ import annotations
@@ -103,8 +107,13 @@ def velocity_matrix(positions_m: Array) -> Array:
     return np.stack([np.stack([one, none, -y_m], -1), np.stack([none, one, x_m], -1)], 1).reshape(-1, 3)
 
 
-def rolling_matrix(positions_m: Array, direction_rad: Array) -> Array:
+def rolling_matrix(positions_m: Array, direction_rad: Array, roller_rad: Array | float = 0.0) -> Array:
     """Return J (..., wheels, 3): circumferential speeds of wheels that roll without slip are J times the twist.
+
+    Parameters
+    ----------
+    positions_m, direction_rad : (wheels, 2), and (..., wheels) that each drives along
+    roller_rad : from there to the axis of its rollers, of each or all
 
     Examples
     --------
@@ -115,12 +124,17 @@ def rolling_matrix(positions_m: Array, direction_rad: Array) -> Array:
     """
     positions = finite_numbers("positions_m", positions_m, 2)
     direction = finite_numbers("direction_rad", direction_rad, len(positions), missing=True)
-    (x_m, y_m), cos, sin = positions.T, np.cos(direction), np.sin(direction)
-    return np.stack([cos, sin, x_m * sin - y_m * cos], axis=-1)
+    axis, (x_m, y_m) = direction + roller_rad, positions.T
+    cos, sin = np.cos(axis), np.sin(axis)
+    return np.stack([cos, sin, x_m * sin - y_m * cos], axis=-1) / np.cos(roller_rad + 0.0 * axis)[..., None]
 
 
 def no_slip_twist(
-    positions_m: Array, direction_rad: Array, wheel_speed_mps: Array, rolls_across: bool = False
+    positions_m: Array,
+    direction_rad: Array,
+    wheel_speed_mps: Array,
+    rolls_across: bool = False,
+    roller_rad: Array | float = 0.0,
 ) -> tuple[Array, Array]:
     """Return the twist that fits wheels which do not slip best, and how far they contradict each other.
 
@@ -130,6 +144,7 @@ def no_slip_twist(
     direction_rad : (..., wheels) that each drives along
     wheel_speed_mps : (..., wheels) circumferential; NaN, here or there, is a missing sample
     rolls_across : whether wheels roll across their direction too, as omni wheels; others do not move there
+    roller_rad : as :func:`rolling_matrix` takes it
 
     Returns
     -------
@@ -147,7 +162,7 @@ def no_slip_twist(
     >>> twist.round(3) + 0.0, residual_mps.round(3)
     (array([0.995, 0.   , 0.2  ]), np.float64(0.0))
     """
-    rows = rolling_matrix(positions_m, direction_rad)
+    rows = rolling_matrix(positions_m, direction_rad, roller_rad)
     speed = finite_numbers("wheel_speed_mps", wheel_speed_mps, rows.shape[-2], missing=True)
     if not rolls_across:
         across = rolling_matrix(positions_m, np.asarray(direction_rad) + np.pi / 2)

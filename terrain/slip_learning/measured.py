@@ -69,7 +69,7 @@ from terrain.kernels import njit
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
 from terrain.kinematics.logged_wheels import speed_columns
-from terrain.kinematics.wheels import no_slip_twist, point_velocity, rolling_matrix, wheel_frame_velocities
+from terrain.kinematics.wheels import no_slip_twist, point_velocity, rolling_matrix
 from terrain.logs.schema import POSE_CHANNELS, TWIST
 from terrain.records import Array, RunLog, SlipTrack, Stream
 from terrain.robots import Robot, robot_named
@@ -387,10 +387,12 @@ def measured_slip(
     u, u_std = window_rates(*rolled, start_s, end_s, *enough)
     twist, twist_std = window_rates(path.time_s, path.values, path.part, start_s, end_s, *enough)
     place_m, direction = robot.wheel_positions_m, wheel_directions(run, robot, start_s, end_s)
-    along, _ = wheel_frame_velocities(twist, place_m, direction)
-    along_std = np.sqrt(((rolling_matrix(place_m, direction) * twist_std[:, None, :]) ** 2).sum(axis=-1))
+    rolling = rolling_matrix(place_m, direction, robot.roller_angles_rad)
+    along = (rolling * twist[:, None, :]).sum(axis=-1)
+    along_std = np.sqrt(((rolling * twist_std[:, None, :]) ** 2).sum(axis=-1))
     slip, slip_std = _slip(u, u_std, along, along_std)
-    rolled_twist, _ = no_slip_twist(place_m, direction, u, robot.on_omni_wheels)
+    rollers = robot.on_omni_wheels, robot.roller_angles_rad
+    rolled_twist, _ = no_slip_twist(place_m, direction, u, *rollers)
     speed = np.linalg.norm(rolled_twist[:, :2], axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         ahead = rolled_twist[:, :2] / speed[:, None]
@@ -561,7 +563,8 @@ def _misfits(run: RunLog, robot: Robot, lags_s: Array, n_parts: int) -> list[Arr
     end_s = start_s + DELAY_WINDOW_S
     u, _ = window_rates(*_rolled(time_s, speeds), start_s, end_s, 3, 0.4)
     directions = wheel_directions(run, robot, start_s, end_s)
-    rolled, _ = no_slip_twist(robot.wheel_positions_m, directions, u, robot.on_omni_wheels)
+    rollers = robot.on_omni_wheels, robot.roller_angles_rad
+    rolled, _ = no_slip_twist(robot.wheel_positions_m, directions, u, *rollers)
     scale = np.array([1.0, 1.0, float(np.linalg.norm(robot.wheel_positions_m, axis=1).max())])
     rates = (
         window_rates(times_s, values, part, start_s + lag_s, end_s + lag_s, 3, 0.4)[0] for lag_s in lags_s

@@ -43,16 +43,17 @@ kinematic bicycle, and ``|v|``, so that it drives backward.  Where nothing chang
 ``x = (c, w)`` follows that, ``dx/dt = A (x - s)``, exactly for an ``s`` that runs straight from sample to sample and
 an ``A`` of the step's mean speed.  Understeer is ``K`` more, by a front axle that yields; ``L + K v |v|`` is kept above
 a tenth of ``L``: there, near the speed at which a car spins, the linear model ends, and a front axle that yields enough
-takes its place.  There are no currents.
+takes its place.  There are no currents.  A tricycle is one whose front wheel drives, with the speed u: ``v = u cos d``.
 
-**Omni robots**: each wheel pulls along its drive direction, rollers resist across it.  Wheel i at :math:`p_i` carries
-the share :math:`n_i` of the weight W, turns with the circumferential speed :math:`u_i`, and with the twist V of the
-centre of mass its own centre moves by :math:`D_i V` along the direction that it drives and by :math:`E_i V` across it.
+**Omni and mecanum robots**: each wheel pulls along its drive direction, rollers resist as they turn.  Wheel i at
+:math:`p_i` carries the share :math:`n_i` of the weight W, turns with the circumferential speed :math:`u_i`, and with
+the twist V of the centre of mass has to turn with :math:`D_i V` for its roller to slip nowhere; its centre moves by :math:`E_i V` across the roller's axis, which is at an angle :math:`g_i` to its drive direction, 0 of an omni wheel
+(:mod:`terrain.kinematics.wheels`); the roller turns with :math:`E_i V + u_i \sin g_i`.
 Over the root mean square speed U of the wheels or, where that is larger, of their centres, so that slip does not depend
 on speed, the forces on it are
 
 .. math::
-    F_i = n_i W C \frac{u_i - D_i V}{U}, \qquad G_i = -r\, n_i W \frac{E_i V}{U} .
+    F_i = n_i W C \frac{u_i - D_i V}{U}, \qquad G_i = -r\, n_i W \frac{E_i V + u_i \sin g_i}{U} .
 
 C is the traction over the load of the ground at the root mean square slip of the wheels, over that slip, and r the
 friction of the rollers over the load; steady motion depends on :math:`\rho = r / C` alone, the force that it takes on
@@ -64,13 +65,15 @@ slope
 A contact follows within :math:`U / (C g)`, some milliseconds: steps are implicit in V, which is stable at rest, too,
 and without inertia, resistance and slope (:func:`terrain.slip_learning.rollers.steady_twist`) is linear in V,
 
-.. math:: \sum_i n_i \left(D_i^T D_i + \rho\,E_i^T E_i\right) V = \sum_i n_i D_i^T u_i .
+.. math:: \sum_i n_i \left(D_i^T D_i + \rho\,E_i^T E_i\right) V
+    = \sum_i n_i \left(D_i^T - \rho \sin g_i\,E_i^T\right) u_i .
 
 Without roller friction the wheels drive what they roll; with ever more of it the body stands.  A common factor
 :math:`1 - \kappa` on V stands for an effective radius, or a scale of what measures V, that is off: it slips alike in
-all directions, and no log of both distinguishes the two.  What is assumed: three wheels at even angles whose loads
-follow from the centre of mass and do not shift; one C and r for all wheels; friction of the rollers that grows with the
-speed across over U; in steady motion a contact that is linear in its slip, and no other resistance.
+all directions, and no log of both distinguishes the two.  What is assumed: loads of the wheels that follow from the
+centre of mass (of more than three wheels those of least squares) and do not shift; one C and r for all wheels;
+friction of the rollers that grows with the speed of their turning over U; in steady motion a contact that is linear in
+its slip, and no other resistance.
 
 **Swerve robots**: all wheels slip as one contact with the ground, by a twist of three parts: the speeds of the centre
 of mass along and across, and the yaw rate times the root mean square distance ``r`` of the wheels from it.  Without
@@ -526,27 +529,28 @@ LEAST_RATIO = 0.1
 STEEPEST_RAD = 1.3  # steering angle at the most, where its tangent is 3.6
 
 _AXLES = "wheelbase_m com_ahead_m front_cornering_npr rear_cornering_npr yaw_inertia_kgm2"
-AXLES = record({"body": PLANAR_BODY} | numbers(_AXLES))
+AXLES = record({"body": PLANAR_BODY} | numbers(_AXLES) | {"front_driven": bool})
 
 
 @njit
 def _move_bicycle(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array:
-    """Return motion and traction: the last wheel is the rear one, the first angle that of the front wheel."""
+    """Return motion and traction: the last wheel is the rear one, the first, with its angle, the front one."""
     wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance = inputs
     body, p, n = params[0].body, vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
     out = np.zeros(n, TRUTH)
-    u = wheel_speed_mps[:, -1] * (1.0 + p.wheel_radius_ratio)
+    angle = (1.0 + p.steering_gain_ratio) * steer_rad[:, 0] + p.steering_offset_front_rad
+    steer = steered(angle, p.steering_delay_s, p.steering_backlash_rad, dt)
+    driven = wheel_speed_mps[:, 0] * np.cos(steer) if params[0].front_driven else wheel_speed_mps[:, -1]
+    u = driven * (1.0 + p.wheel_radius_ratio)
     speed, rest, slip = slip_along(body, p, dt, u, np.zeros(n), grade_rad, disturbance, True)
     accel = slopes(speed, dt)
     mass = body.mass_kg * (1.0 + p.payload_ratio)
     for k in range(n):
         out[k].force_n = mass * accel[k] + rest[k]
         out[k].speed_x_mps, out[k].slip_ratio = speed[k], slip[k]
-    angle = steer_rad[:, 0] + p.steering_offset_front_rad
-    steer = steered(angle, p.steering_delay_s, p.steering_backlash_rad, dt)
     car, nominal = params[0], body.mass_kg
     inertia = car.yaw_inertia_kgm2 * (1.0 + p.payload_ratio)
-    wheelbase, a = car.wheelbase_m, car.com_ahead_m
+    wheelbase, a = car.wheelbase_m * (1.0 + p.wheelbase_ratio), car.com_ahead_m
     b = wheelbase - a
     soft = 1.0 / (1.0 + p.cornering_stiffness_ratio)
     front = soft / car.front_cornering_npr  # compliance of the axles
@@ -599,7 +603,9 @@ def _front(mass: float, wheelbase: float, a: float, front: float, rear: float, v
 
 
 BICYCLE = PlanarDrive(
-    AXLES, lambda robot, ground: {name: getattr(robot, name) for name in _AXLES.split()}, _move_bicycle
+    AXLES,
+    lambda robot, ground: {name: getattr(robot, name) for name in (*_AXLES.split(), "front_driven")},
+    _move_bicycle,
 )
 
 
@@ -611,24 +617,35 @@ STIFFEST, STIFFEST_GROUND = 0.1, 1e-6
 # Implicit steps within one of the simulation, so that their lag, half of each, is about a millisecond.
 SUBSTEPS = 4
 
-ROLLERS = record(
-    {"body": PLANAR_BODY, "wheel_load_ratio": (float, 3), **numbers("wheel_distance_m roller_ratio")}
-    | dict.fromkeys(("along", "across", "to_rolled"), (float, (3, 3)))
-)
-"""``along`` and ``across`` (wheels, 3) give the speed of each wheel's centre along and across its direction for a twist
-of the centre of mass, ``to_rolled`` (3, wheels) the twist of the body without slip."""
+
+def rollers_record(wheels: int) -> np.dtype[Any]:
+    """Return the record of a robot on so many wheels with rollers.
+
+    ``along`` and ``across`` (wheels, 3) give the speed of each wheel and that of its centre across its roller's axis
+    for a twist of the centre of mass, ``sine`` (wheels,) that of the angle of the axis, ``to_rolled`` (3, wheels) the
+    twist of the body without slip; ``place_m`` (wheels, 2) is in the body.
+    """
+    return record(
+        {"body": PLANAR_BODY, **dict.fromkeys(("wheel_load_ratio", "sine"), (float, wheels))}
+        | dict.fromkeys(("along", "across"), (float, (wheels, 3)))
+        | {"to_rolled": (float, (3, wheels)), "place_m": (float, (wheels, 2))}
+        | numbers("wheel_distance_m roller_ratio")
+    )
 
 
 def _omni_numbers(robot: Robot, ground: Ground) -> dict[str, Any]:
-    body, direction = robot.completed.body, robot.wheel_directions_rad
-    arm_m = robot.wheel_positions_m - np.array([body.com_x_m, body.com_y_m])
-    moments = np.vstack([np.ones(len(arm_m)), arm_m.T])
+    body, place_m = robot.completed.body, robot.wheel_positions_m
+    direction, roller = robot.wheel_directions_rad, robot.roller_angles_rad
+    arm_m = place_m - np.array([body.com_x_m, body.com_y_m])
+    moments, rolled = np.vstack([np.ones(len(arm_m)), arm_m.T]), rolling_matrix(place_m, direction, roller)
     return {
-        "along": rolling_matrix(arm_m, direction),
-        "across": rolling_matrix(arm_m, direction + np.pi / 2),
-        "to_rolled": np.linalg.pinv(rolling_matrix(robot.wheel_positions_m, direction)),
+        "along": rolling_matrix(arm_m, direction, roller),
+        "across": rolling_matrix(arm_m, direction + roller + np.pi / 2),
+        "sine": np.sin(roller),
+        "to_rolled": np.linalg.pinv(rolled),
+        "place_m": place_m,
         "wheel_load_ratio": np.linalg.pinv(moments) @ np.array([1.0, 0.0, 0.0]),
-        "wheel_distance_m": float(np.hypot(*robot.wheel_positions_m[0])),
+        "wheel_distance_m": float(np.abs(rolled[0, 2])),
         "roller_ratio": ground.roller_ratio,
     }
 
@@ -668,8 +685,9 @@ def _move_omni(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array
                 v = _dot(along[i], before)
                 share = load[i]
                 drag = share * body.rolling_ratio * weight / math.sqrt(v * v + ROLLING_MPS * ROLLING_MPS)
+                spun = wheels[i] * rollers.sine[i]
                 for a in range(3):
-                    pushed[a] += share * stiff * wheels[i] * along[i, a]
+                    pushed[a] += share * (stiff * wheels[i] * along[i, a] - resists * spun * across[i, a])
                     for b in range(3):
                         matrix[a, b] += (share * stiff + drag) * along[i, a] * along[i, b]
                         matrix[a, b] += share * resists * across[i, a] * across[i, b]
@@ -714,7 +732,7 @@ def currents_of(params: Array, vector: Array, dt: float, wheel_speed_mps: Array,
 
     Parameters
     ----------
-    params : (1,) of :data:`ROLLERS`
+    params : (1,) of :func:`rollers_record`
     vector, dt, wheel_speed_mps : as :func:`~terrain.simulation.plants.planar.move` takes them
     truth : (n,) of the motion, without disturbance
     """
@@ -722,7 +740,8 @@ def currents_of(params: Array, vector: Array, dt: float, wheel_speed_mps: Array,
     body, out = rollers.body, np.empty((n, wheels))
     weight = body.mass_kg * (1.0 + p.payload_ratio) * GRAVITY_MPS2
     radius_m, twist = body.radius_m * (1.0 + p.wheel_radius_ratio), np.empty(3)
-    along, _, load = _placed(rollers, p)
+    along, across, load = _placed(rollers, p)
+    friction = rollers.roller_ratio + p.roller_friction_ratio
     com_x, com_y = body.com_x_m + p.load_shift_x_m, body.com_y_m + p.load_shift_y_m
     spun = np.empty((n, wheels))
     for i in range(wheels):
@@ -738,6 +757,8 @@ def currents_of(params: Array, vector: Array, dt: float, wheel_speed_mps: Array,
         stiff = _stiffness(body, p, size) * weight / speed
         for i in range(wheels):
             pull = load[i] * stiff * (u[i] - _dot(along[i], twist))
+            turns = _dot(across[i], twist) + u[i] * rollers.sine[i]
+            pull += load[i] * friction * weight / speed * turns * rollers.sine[i]
             torque = (pull + body.rotating_kg / wheels * spun[k, i]) * radius_m
             direction = u[i] / math.sqrt(u[i] * u[i] + ROLLING_MPS * ROLLING_MPS)
             out[k, i] = (torque + body.friction_nm / wheels * direction) / body.nm_per_a
@@ -748,22 +769,28 @@ def currents_of(params: Array, vector: Array, dt: float, wheel_speed_mps: Array,
 def _placed(rollers: Any, p: Any) -> tuple[Array, Array, Array]:
     """Return ``along`` and ``across`` (wheels, 3) and the loads (wheels,) with wheels and load as p has them.
 
-    With the distance d of the wheels, the directions along and across them and out to them, and the centre of mass c,
-    ``D_i`` ends in ``d - c x along``, ``E_i`` in ``-c x across``, and wheel i of three carries
-    ``(1 + 2 c . out / d) / 3``; one that would carry less than nothing carries nothing, and the others then do not
-    balance about c.
+    ``D_i`` and ``E_i`` end in their moments about the centre of mass c, and the loads are the smallest that balance
+    about it; one that would be less than nothing is nothing, and the others then do not balance.
     """
     along, across, load = rollers.along.copy(), rollers.across.copy(), rollers.wheel_load_ratio.copy()
     shift_x, shift_y = p.load_shift_x_m, p.load_shift_y_m
-    distance = rollers.wheel_distance_m * (1.0 + p.wheel_distance_ratio)
-    if shift_x == 0.0 and shift_y == 0.0 and p.wheel_distance_ratio == 0.0:
+    scale = 1.0 + p.wheel_distance_ratio
+    if shift_x == 0.0 and shift_y == 0.0 and scale == 1.0:
         return along, across, load
     com_x, com_y, total = rollers.body.com_x_m + shift_x, rollers.body.com_y_m + shift_y, 0.0
+    moments, ones, balance = np.zeros((3, 3)), np.array([1.0, 0.0, 0.0]), np.empty(3)
+    arm = np.ones((rollers.body.n_wheels, 3))
     for i in range(rollers.body.n_wheels):
-        out = com_x * along[i, 1] - com_y * along[i, 0]
-        along[i, 2] = distance - out
-        across[i, 2] = -(com_x * across[i, 1] - com_y * across[i, 0])
-        load[i] = max(1.0 + 2.0 * out / distance, 0.0) / rollers.body.n_wheels
+        x, y = scale * rollers.place_m[i, 0] - com_x, scale * rollers.place_m[i, 1] - com_y
+        along[i, 2] = x * along[i, 1] - y * along[i, 0]
+        across[i, 2] = x * across[i, 1] - y * across[i, 0]
+        arm[i, 1], arm[i, 2] = x, y
+        for a in range(3):
+            for b in range(3):
+                moments[a, b] += arm[i, a] * arm[i, b]
+    _solve(moments, ones, balance)
+    for i in range(rollers.body.n_wheels):
+        load[i] = max(_dot(arm[i], balance), 0.0)
         total += load[i]
     return along, across, load / total
 
@@ -805,7 +832,8 @@ def _solve(matrix: Array, pushed: Array, out: Array) -> None:
     out[2] = (p2 * x + q2 * y + r2 * z) * by
 
 
-OMNI = PlanarDrive(ROLLERS, _omni_numbers, _move_omni, drifts=False)
+OMNI = PlanarDrive(rollers_record(3), _omni_numbers, _move_omni, drifts=False)
+MECANUM = PlanarDrive(rollers_record(4), _omni_numbers, _move_omni, drifts=False)
 
 
 # Relaxation length of a contact that has none, and what a body without yaw inertia weighs at its wheels.
@@ -960,7 +988,9 @@ DRIVES: Mapping[str, PlanarDrive] = {
     "tracked": SKID,
     "swerve": SWERVE,
     "omni": OMNI,
+    "mecanum": MECANUM,
     "bicycle": BICYCLE,
+    "tricycle": BICYCLE,
 }
 """By the name of a robot's drive."""
 
