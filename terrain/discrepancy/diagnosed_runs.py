@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from terrain.discrepancy.compared import ComparedRun, compare_runs, without_levels
 from terrain.discrepancy.constancy import PartValues, part_values
 from terrain.discrepancy.diagnose import diagnose
-from terrain.discrepancy.evidence import evidence_at
+from terrain.discrepancy.grounds import simulation_for
 from terrain.discrepancy.health.fault import repaired
 from terrain.discrepancy.held_out import (
     HOLD_OUT_FROM,
@@ -31,20 +31,16 @@ from terrain.discrepancy.runs import (
     Signals,
     Simulation,
     TerrainMatch,
-    drivable,
     low_pass_of,
     signals_of,
 )
-from terrain.discrepancy.search import Problem, names_of
+from terrain.discrepancy.search import Problem
 from terrain.discrepancy.verdict import INTERVAL_T, Diagnosis
-from terrain.effects import CHANNELS, Effect, parameters_of
+from terrain.effects import CHANNELS, Effect
 from terrain.errors import ConfigError, DataError
-from terrain.files.names import packaged
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
-from terrain.simulation.plants.planar import Ground, planar_ground, probe_error, spread_numbers
-from terrain.terramechanics.soil import EXTRA, load_soil, soil_names
 
 ACTS_RATIO = 0.25
 """Least part of the change of a channel by all causes, root mean square, that one of them makes to be named
@@ -224,63 +220,6 @@ def extended_effects(
     return values, cov, {name: (values[name] - halves[name], values[name] + halves[name]) for name in names}
 
 
-# -- The simulation that runs are compared with, on the terrain that each label names --------------------------
-
-#: Effective ratios that are tried; the best lies on the parabola through their losses.
-RATIOS = (0.0, 0.5, 1.0)
-#: All of the tilt counts as a slope, unless a smaller part fits better by that in minus twice the log-likelihood.
-TILT_LOSS = 20.0
-
-
-def simulation_for(
-    runs: Sequence[RunLog],
-    robot: Robot,
-    library: Sequence[Effect],
-    signals: Sequence[Signals] | None = None,
-) -> tuple[Simulation, tuple[TerrainMatch, ...]]:
-    """Return the simulation of runs, and the terrain that each of their labels is simulated on.
-
-    A label that is the name of a soil of the package is simulated on that soil, all others on the default terrain.  On
-    soils the simulation has an error of its own, and a part of the measured tilt acts as a slope: a tilt that is none,
-    of a body that rides over bumps, takes no traction; simulated as a slope it biases mass, resistance and slip.  The
-    runs fit best with the part that acts, all parameters of the library freed.  The ``signals`` of the runs are taken
-    where they are known already.
-    """
-    labels = sorted({run.terrains[0] if len(run.terrains) == 1 else "" for run in runs})
-    known, grounds = {*soil_names(), *packaged(EXTRA)}, {}
-    for label in labels:
-        if label in known and drivable(robot, label):
-            grounds[label] = planar_ground(robot, load_soil(label))
-    simulation = Simulation(robot, Ground(), robot.effects, spread_numbers("scatter"), grounds)
-    if grounds:
-        parameters = parameters_of(robot.drive)
-        errors: dict[str, Any] = {"probe_error": probe_error()}
-        for kind in ("model_error", "varied_error", "varied_scatter"):
-            errors[kind] = {n: size for n, size in spread_numbers(kind).items() if n in parameters}
-        simulation = replace(simulation, **errors)
-    if signals is None:
-        signals = [signals_of(run, robot) for run in runs] if grounds else []
-    for label, ground in list(grounds.items()):
-        own = [run for run in signals if run.terrain == label]
-        if not own:
-            continue
-        losses = np.zeros(len(RATIOS))
-        for k, ratio in enumerate(RATIOS):
-            tried = replace(simulation, grounds={label: ground._replace(effective_ratio=ratio)})
-            info = evidence_at(own, tried, simulation.vector, names_of(library), low_pass_of(own))
-            # minus twice the log-likelihood of what the whole library leaves, up to a constant
-            scale = -np.log(np.abs(info.noise.filters[:, 0]))
-            for run in info.rows:
-                size = np.log(info.noise.size(run.pace_mps)) + scale
-                losses[k] += 2.0 * float(size[np.isfinite(run.residual) & np.isfinite(size)].sum())
-        ratio, least = best_ratio(losses)
-        effective = ratio if losses[-1] - least > TILT_LOSS else 1.0
-        grounds[label] = ground._replace(effective_ratio=effective)
-    ratios = {label: ground.effective_ratio for label, ground in grounds.items()}
-    matches = (TerrainMatch(label, label if label in ratios else None, ratios.get(label)) for label in labels)
-    return replace(simulation, grounds=grounds), tuple(matches)
-
-
 def chosen_runs(runs: Sequence[RunLog], robot: Robot, terrain: str | None) -> list[RunLog]:
     """Return the runs that are of one label throughout; all of them where none is asked for.
 
@@ -301,16 +240,3 @@ def chosen_runs(runs: Sequence[RunLog], robot: Robot, terrain: str | None) -> li
             f"{n} of {len(chosen)} runs are of the robot {name!r}; the simulation is of {robot.name!r}"
         )
     return chosen
-
-
-def best_ratio(losses: Array) -> tuple[float, float]:
-    """Return the ratio, 0 to 1, and the loss at the minimum of the parabola through the losses of RATIOS.
-
-    Examples
-    --------
-    >>> best_ratio(np.array([1.0, 0.0, 1.0]))[0], best_ratio(np.array([0.0, 2.0, 8.0]))[0]
-    (0.5, 0.0)
-    """
-    a, b, c = np.polyfit(RATIOS, losses, 2)
-    bottom = min(max(-b / (2.0 * a), 0.0), 1.0) if a > 0.0 else float(RATIOS[int(np.argmin(losses))])
-    return round(float(bottom), 3), float(a * bottom**2 + b * bottom + c)

@@ -25,7 +25,7 @@ from studies.blind_trials.drives import (
 )
 from studies.blind_trials.limits import Limits, Sensing, confusable_class, limits_of
 from terrain.discrepancy.diagnose import diagnose
-from terrain.discrepancy.diagnosed_runs import simulation_for
+from terrain.discrepancy.grounds import simulation_for
 from terrain.discrepancy.health.fault import Column, FaultKind
 from terrain.discrepancy.held_out import split_runs
 from terrain.discrepancy.runs import Simulation

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from terrain.discrepancy.diagnose import diagnose
-from terrain.discrepancy.diagnosed_runs import diagnose_runs, simulation_for
+from terrain.discrepancy.diagnosed_runs import diagnose_runs
+from terrain.discrepancy.grounds import simulation_for
 from terrain.discrepancy.health.readings import candidate_changes
 from terrain.discrepancy.powertrain import traces_of
 from terrain.discrepancy.robot_terms import in_robot_terms, value_in_robot_terms
@@ -114,23 +115,37 @@ def test_an_effect_hidden_in_the_plant_is_named_and_nothing_else(effects, option
         assert diagnosis.verdict in (None, Tier.NOT_SHOWN)
 
 
-def test_a_run_is_simulated_on_the_soil_of_its_label_or_the_default_terrain():
-    runs = dynamic_runs(n=2, duration_s=10.0)
-    unknown = [replace(run, run_id=f"u{i}", labels=(Label(0.0, 5.0, "moon"),)) for i, run in enumerate(runs)]
-    several = replace(runs[0], run_id="s", labels=(Label(0.0, 5.0, "grass"), Label(5.0, 9.0, "snow")))
-    simulation, matches = simulation_for([*runs, *unknown, several], AGRIMARO, LIBRARY)
-    assert [match[:2] for match in matches] == [("", None), ("grass", "grass"), ("moon", None)]
+def relabelled(runs, label):
+    return [replace(run, labels=(Label(0.0, 5.0, label),)) for run in runs]
+
+
+def test_runs_are_simulated_on_the_soil_of_their_label_where_they_need_it():
+    runs = dynamic_runs(n=6, duration_s=20.0)
+    simulation, matches = simulation_for(runs, AGRIMARO, LIBRARY)
+    assert [match[:2] for match in matches] == [("grass", "grass")]
     soil = planar_ground(AGRIMARO, load_soil("grass"))
     assert simulation.grounds["grass"]._replace(effective_ratio=1.0) == soil
-    on = [simulation.planar_on("grass"), simulation.planar_on("moon"), make_planar(AGRIMARO, Ground())]
+    assert simulation.model_error
+    on = [simulation.planar_on(label) for label in ("grass", "moon", "")]
     grass, moon, plain = (planar.params.tobytes() for planar in on)
     assert grass == make_planar(AGRIMARO, simulation.grounds["grass"]).params.tobytes() != plain
-    assert moon == simulation.planar_on("").params.tobytes() == plain
-    assert simulation_for(unknown, AGRIMARO, LIBRARY)[0].grounds == {}
+    assert moon == plain == make_planar(AGRIMARO, Ground()).params.tobytes()
+
+
+def test_a_label_that_helps_no_run_changes_nothing():
+    """No label, that of another soil, and a foreign word: one simulation."""
+    runs = dynamic_runs(robot=HUSKY, terrain="asphalt", n=4, duration_s=15.0)
+    several = replace(runs[0], labels=(Label(0.0, 5.0, "grass"), Label(5.0, 9.0, "snow")))
+    for label in ("snow", "moon"):
+        given = [*relabelled(runs, label), replace(several, run_id="s")]
+        simulation, matches = simulation_for(given, HUSKY, library_of("skid_steer"))
+        assert [match[:2] for match in matches] == [("", None), (label, None)]
+        assert (simulation.grounds, simulation.model_error) == ({}, {})
 
 
 @pytest.mark.parametrize(("robot", "effective"), [(AGRIMARO, 0.0), (HUSKY, 1.0)])
 def test_tilt_acts_as_a_slope_but_not_where_a_body_rides_over_bumps(robot, effective):
-    runs = dynamic_runs(robot=robot, n=2, vary=robot is HUSKY, duration_s=40.0)
+    runs = dynamic_runs(robot=robot, n=6, vary=robot is HUSKY, duration_s=30.0)
     simulation, _ = simulation_for(runs, robot, library_of(robot.drive))
-    assert simulation.grounds["grass"].effective_ratio == pytest.approx(effective, abs=0.05)
+    ground = simulation.grounds.get("grass", Ground())
+    assert ground.effective_ratio == pytest.approx(effective, abs=0.05)
