@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from terrain.discrepancy.health.agreement import LEAST, MOTION, Agreement, G, H, X, Y, medians
-from terrain.discrepancy.runs import Rows
+from terrain.discrepancy.runs import Rows, Signals
 from terrain.records import Array
 from terrain.signals import true_stretches
 
@@ -25,6 +25,8 @@ STALLED_RATIO, NOMINAL_RATIO = 0.25, 0.05
 #: A run stalls that does so for the first in all, or for the third of the time that it should move, in stretches of the
 #: second at the least, and far longer than the others.
 STALLED_S, STRETCH_S, ALL_RATIO = 2.0, 1.0, 0.8
+MEAN_S = 0.5  #: Time over which the motion of a body is averaged: noise at rest has no mean.
+MIN_SHOWN_RATIO = 1 / 3  #: Ratio of a stretch in which the body has to be seen at rest.
 FLOOR = np.array(
     [0.02, 0.015, 0.02]
 )  #: What sensors measure of the motion of a body at rest (rad/s, m/s, rad/s).
@@ -58,9 +60,16 @@ def common_gains(follows: Agreement) -> Array:
 
 
 def stalled_runs(
-    runs: Sequence[Rows], follows: Agreement, has_clock: Sequence[bool], extra_s: float
+    signals: Sequence[Signals],
+    runs: Sequence[Rows],
+    follows: Agreement,
+    has_clock: Sequence[bool],
+    extra_s: float,
 ) -> dict[int, str]:
     """Return runs whose wheels turn while the body hardly responds, far longer than in the others, and why.
+
+    What the body does is the mean of its samples over a time, as far as they are known: noise at rest has no mean,
+    and a lidar's windows have holes, which a low-pass widens.
 
     Stretches have to be longer by ``extra_s`` where the clock of a run is not known and the run does not follow the
     wheels on the clock of all: a clock of its own looks like a short stall.
@@ -71,37 +80,54 @@ def stalled_runs(
     least_ratio = np.where(np.isfinite(common), STALLED_RATIO, NOMINAL_RATIO)[MOTION]
     common = np.where(np.isfinite(common), common, 1.0)
     stalls, time_s, asked_s = [], [], []
-    for run, clock, fit in zip(runs, has_clock, follows.correlation, strict=True):
-        expected, seen = run.predicted * common, run.measured.copy()
+    for log, run, clock, fit in zip(signals, runs, has_clock, follows.correlation, strict=True):
+        expected, seen = run.predicted * common, _means_about(log, run.time_s)
         straight = np.isfinite(seen[:, G]) & (np.abs(expected[:, G]) < STRAIGHT_RADPS)
         if straight.sum() >= MIN_STRAIGHT:
             seen[:, G] -= np.median(seen[straight, G])
         size, should = np.abs(seen[:, MOTION]), np.abs(expected[:, MOTION])
         sideways = np.where(np.isfinite(seen[:, Y]), seen[:, Y], 0.0)  # the body may slide
         size[:, 1] = np.hypot(size[:, 1], sideways)
-        known, still = np.isfinite(size), size < least_ratio * should + FLOOR
-        asked = (known & (should > LEAST[MOTION])).any(axis=1)
-        stalled = asked & (known & still).any(axis=1) & ~(known & ~still).any(axis=1)
+        known, asks = np.isfinite(size), should > LEAST[MOTION]
+        moves = (known & (size >= np.where(asks, least_ratio * should + FLOOR, LEAST[MOTION]))).any(axis=1)
+        shows = (known & asks).any(axis=1)
+        # a stall goes on through holes
+        stalled = (asks & known.any(axis=0)).any(axis=1) & ~moves
         least_s = STRETCH_S + (0.0 if clock or (fit[MOTION] > FOLLOWS).any() else extra_s)
         for start, end in true_stretches(stalled):
-            stalled[start:end] = (end - start) * run.period_s >= least_s
-        stalls.append((expected, stalled))
+            lasts = (end - start) * run.period_s >= least_s
+            stalled[start:end] = lasts and shows[start:end].mean() >= MIN_SHOWN_RATIO
+        stalls.append((expected, seen, stalled))
         time_s.append(run.period_s * stalled.sum())
-        asked_s.append(run.period_s * asked.sum())
+        asked_s.append(run.period_s * shows.sum())
     reasons = {}
-    for i, (run, (expected, stalled)) in enumerate(zip(runs, stalls, strict=True)):
+    for i, (expected, seen, stalled) in enumerate(stalls):
         least_s = min(STALLED_S, max(ALL_RATIO * asked_s[i], STRETCH_S))
         if time_s[i] < least_s + 3.0 * float(np.median(np.delete(time_s, i))):
             continue
         words = []
         for c, text in STALLS.items():
-            moves, does = np.abs(expected[stalled, c]), np.abs(run.measured[stalled, c])
+            moves, does = np.abs(expected[stalled, c]), np.abs(seen[stalled, c])
             there = np.isfinite(does)
             if there.any() and moves[there].mean() > LEAST[c]:
                 words.append(text.format(moves[there].mean(), does[there].mean()))
         words.append("its wheels turn, its body is at rest")
         reasons[i] = f"it is stalled for {time_s[i]:.1f} s in all: {words[0]}"
     return reasons
+
+
+def _means_about(log: Signals, time_s: Array) -> Array:
+    """Return the means (m, channels) of what is known of channels about some times; NaN for too little."""
+    half = max(round(0.5 * MEAN_S / log.dt_s), 1)
+    at = np.round(time_s / log.dt_s).astype(int)
+    first, end = np.maximum(at - half, 0), np.minimum(at + half + 1, len(log))
+    known = np.isfinite(log.measured)
+    total, n = (
+        np.concatenate([np.zeros((1, known.shape[1])), np.cumsum(each, axis=0)])
+        for each in (np.where(known, log.measured, 0.0), known)
+    )
+    some = n[end] - n[first]
+    return np.where(some >= half, (total[end] - total[first]) / np.maximum(some, 1), np.nan)
 
 
 def odd_runs(runs: Sequence[Rows], follows: Agreement, among: Sequence[int]) -> dict[int, str]:

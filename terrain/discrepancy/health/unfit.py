@@ -75,7 +75,7 @@ def unfit_runs(
     follows, every = agreement_of(runs), range(len(runs))
     has_clock = [bool(known.any()) for known in np.isfinite(shift.lag_s)]
     reasons = _frozen(signals, info.rows)
-    reasons |= stalled_runs(runs, follows, has_clock, MAX_LAG_S + MARGIN_S - STRETCH_S)
+    reasons |= stalled_runs(signals, runs, follows, has_clock, MAX_LAG_S + MARGIN_S - STRETCH_S)
     reasons |= _late(info, shift) | _dead(signals, runs, follows)  # the last of these counts
     reasons |= odd_runs(runs, follows, [i for i in every if i not in reasons])
     reasons |= _unlike(info, [i for i in every if i not in reasons])

@@ -435,8 +435,9 @@ def responses(runs):
     return on_own_clocks(rows_and_low_pass(signals, simulation)[0], latencies_of(signals, simulation))
 
 
-def stalls(compared):
-    return stalled_runs(compared, agreement_of(compared), [False] * len(compared), WAIT_S)
+def stalls(runs):
+    signals, compared = [signals_of(run, HUSKY) for run in runs], responses(runs)
+    return stalled_runs(signals, compared, agreement_of(compared), [False] * len(compared), WAIT_S)
 
 
 def odd(compared):
@@ -445,13 +446,13 @@ def odd(compared):
 
 def test_stalled_runs_are_named_also_those_that_stall_later_and_runs_that_scatter_are_none():
     runs = runs_of(40, 0.15)
-    for few in (responses(runs_of(6, 0.35)), responses(runs)):
-        assert odd(few) == stalls(few) == {}
+    for few in (runs_of(6, 0.35), runs):
+        assert odd(responses(few)) == stalls(few) == {}
     which, rest = {3: 0.0, 9: 0.0, 20: 3.0, 31: 0.0}, np.random.default_rng(0)
     for i, from_s in which.items():
         still = edit(lambda t, v, at=from_s: np.where(t >= at, rest.normal(0.0, 0.003, v.shape), v), **MOTION)
         runs[i] = still(runs[i])
-    reasons = stalls(responses(runs))
+    reasons = stalls(runs)
     assert set(reasons) == set(which)
     assert "it is stalled for" in reasons[3]
     assert "its body turns at 0.0" in reasons[3]
@@ -551,6 +552,6 @@ def test_measured_huskies_have_no_fault_and_what_is_late_or_stuck_is_found(measu
         assert found.pop("clock_offset_s") == pytest.approx(-0.265, abs=0.03)
         assert found == {"camera_latency_s": pytest.approx(0.16, abs=0.05)}
     if folder == "borealtc":
-        compared = responses([run for run in runs if run.terrains == ("SNOW",)])
-        stuck = {compared[i].run_id for i in stalls(compared)}
+        snow = [run for run in runs if run.terrains == ("SNOW",)]
+        stuck = {snow[i].run_id for i in stalls(snow)}
         assert stuck == {f"SNOW_{k:02d}" for k in (2, 3, 4, 5, 12, 14, 15, 19, 22)}
