@@ -21,6 +21,7 @@ STUDIES = {
     "intervals": "coverage of the intervals of all that is identified",
     "adaptation": "what adapting to a session gives, by changes hidden in held-out runs",
     "labels": "what chosen questions and self-training gain, from few labels",
+    "foreign": "hide effects in simulators of other equations, and in MuJoCo, explain them, count",
     "trials": "hide effects in simulated runs, diagnose them blindly, count what is right",
     "ablation": "what each signal set is worth to the classifier, on all labelled sets",
     "live": "latency of the live chain by stage, and of the service with many robots",

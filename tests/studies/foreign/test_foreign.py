@@ -1,0 +1,190 @@
+"""The foreign simulator obeys laws of mechanics, its sensors measure what they should, and effects show in logs."""
+
+import doctest
+import math
+
+import numpy as np
+import pytest
+
+from studies.foreign import physics, scoring, sensors, trial, worlds
+from studies.foreign.physics import EVERY, G_MPS2, SAMPLE_S, Body, Motion, integrate
+from studies.foreign.sensors import Motor, Sensing
+from studies.foreign.trial import Answer, Outcome, cases_of, outcome_of
+from studies.foreign.worlds import WORLDS, Driven, driven_by, effects_of, runs_of
+from terrain.effects import library_of
+from terrain.robots import load_robot
+
+SKID = WORLDS["plain", "skid"]().body
+
+
+def moved(body: Body, circumferential_mps, slope=(0.0, 0.0), steer=0.0, yaw=0.0) -> Motion:
+    """Drive one body by wheel speeds (n, wheels) every half step."""
+    rate = np.asarray(circumferential_mps)[:, None] / body.radius_m
+    angles = np.broadcast_to(np.asarray(steer, dtype=float), rate.shape)
+    return integrate(body, rate, angles, np.array([slope]), np.ones(1), np.array([yaw]))
+
+
+def ramp(to, seconds: float = 1.0):
+    """Return wheel speeds that reach their values within 0.5 s."""
+    time_s = np.arange(2 * EVERY * round(seconds / SAMPLE_S) + 1) * physics.STEP_S / 2
+    return np.minimum(time_s / 0.5, 1.0)[:, None] * np.asarray(to)
+
+
+def test_modules_do_as_their_examples():
+    for module in (trial, scoring, worlds, physics, sensors):
+        assert doctest.testmod(module).failed == 0
+
+
+def test_in_steady_motion_the_wheels_pull_what_slope_and_ground_resist():
+    slope = 0.05
+    motion = moved(SKID, ramp([0.6] * 4, 2.0), slope=(slope, 0.0))
+    weight = SKID.mass_kg * G_MPS2
+    np.testing.assert_allclose(motion.pull_n[-1].sum(), weight * (slope + SKID.drag_ratio), rtol=2e-3)
+    np.testing.assert_allclose(motion.load_n[-1].sum(), weight, rtol=1e-9)
+    assert motion.load_n[-1, 0, 2:].sum() > motion.load_n[-1, 0, :2].sum()  # uphill the rear carries more
+    np.testing.assert_allclose(motion.accel_x_mps2[-1], G_MPS2 * slope, rtol=2e-3)
+
+
+def test_a_body_gains_the_energy_that_contacts_and_slope_give_it():
+    body = SKID._replace(drag_ratio=0.0)
+    motion = moved(body, ramp([0.3, 0.9, 0.3, 0.9]), slope=(0.03, 0.02))
+    v, w = np.hypot(motion.speed_x_mps, motion.speed_y_mps)[:, 0], motion.yaw_rate_radps[:, 0]
+    energy = 0.5 * body.mass_kg * v**2 + 0.5 * body.inertia_kgm2 * w**2
+    rise = np.cumsum(motion.slope_x * motion.speed_x_mps + motion.slope_y * motion.speed_y_mps)[-1] * SAMPLE_S
+    circumferential_mps = ramp([0.3, 0.9, 0.3, 0.9])[:: 2 * EVERY]
+    driven_j = (motion.pull_n[:, 0] * circumferential_mps).sum() * SAMPLE_S
+    held_j = energy[-1] + body.mass_kg * G_MPS2 * rise
+    assert 0.0 < held_j < driven_j  # the rest is lost in slip
+
+
+def test_left_and_right_are_mirror_images():
+    left = moved(SKID, ramp([0.2, 0.8, 0.2, 0.8]), slope=(0.03, 0.04), yaw=0.3)
+    right = moved(SKID, ramp([0.8, 0.2, 0.8, 0.2]), slope=(0.03, -0.04), yaw=-0.3)
+    np.testing.assert_allclose(right.speed_x_mps, left.speed_x_mps, atol=1e-9)
+    np.testing.assert_allclose(right.yaw_rate_radps, -left.yaw_rate_radps, atol=1e-9)
+    np.testing.assert_allclose(right.speed_y_mps, -left.speed_y_mps, atol=1e-9)
+
+
+def test_a_smaller_step_gives_the_same_motion(monkeypatch):
+    coarse = moved(SKID, ramp([-0.3, 0.5, -0.3, 0.5]))
+    monkeypatch.setattr(physics, "STEP_S", physics.STEP_S / 2)
+    monkeypatch.setattr(physics, "EVERY", EVERY * 2)
+    circumferential_mps = ramp([-0.3, 0.5, -0.3, 0.5])
+    time_s = np.arange(4 * EVERY * round(1.0 / SAMPLE_S) + 1) * physics.STEP_S / 2
+    fine = moved(SKID, np.minimum(time_s / 0.5, 1.0)[:, None] * circumferential_mps[-1])
+    np.testing.assert_allclose(fine.yaw_rate_radps, coarse.yaw_rate_radps, atol=2e-4)
+
+
+def test_a_skid_steer_robot_turns_less_than_its_track_says():
+    motion = moved(SKID, ramp([-0.5, 0.5, -0.5, 0.5]))
+    track_m = 2 * SKID.wheels_m[0, 1]
+    assert 1.3 < 1.0 / track_m / motion.yaw_rate_radps[-1, 0] < 2.5  # Mandow et al. 2007
+
+
+def test_a_slow_car_drives_its_circle():
+    car = WORLDS["plain", "car"]()
+    length_m, half_m, turn = car.body.wheels_m[0, 0], car.body.wheels_m[0, 1], 0.2
+    steer = [
+        math.atan2(length_m * turn, 1 - half_m * turn),
+        math.atan2(length_m * turn, 1 + half_m * turn),
+        0,
+        0,
+    ]
+    motion = moved(car.body, ramp([0.5] * 4, 2.0), steer=steer)
+    np.testing.assert_allclose(motion.yaw_rate_radps[-1], 0.5 * turn, rtol=0.02)
+
+
+def test_sensors_measure_what_moves():
+    n = 400
+    w, v = np.full((n, 1), 0.5), np.full((n, 1), 0.8)
+    still = np.zeros((n, 1))
+    time_s = np.arange(n) * SAMPLE_S
+    motion = Motion(
+        time_s, v, still, w, w.cumsum(axis=0) * SAMPLE_S, *[still] * 4, *[np.zeros((n, 1, 4))] * 2
+    )
+    rng = np.random.default_rng(0)
+    seen = sensors.lidar_of(motion, Sensing((0.4, 0.1), lidar_yaw_rad=0.2), rng)[0].values
+    mounted = np.array([[math.cos(0.2), math.sin(0.2)], [-math.sin(0.2), math.cos(0.2)]]) @ [0.8 - 0.05, 0.2]
+    np.testing.assert_allclose(np.median(seen, axis=0), [*mounted, 0.5], atol=0.01)
+    gyro = sensors.imu_of(motion, Sensing(gyro_ratio=1.1), rng)[0].channel("gyro_z_radps")
+    np.testing.assert_allclose(gyro.mean(), 0.55, atol=0.01)
+    angle = 3.0 * time_s[:, None]
+    np.testing.assert_allclose(sensors.counted(angle, Sensing())[1:].mean(), 3.0, rtol=1e-3)
+    lossy = sensors.counted(angle, Sensing(lost_ratio=0.5, lost_from_radps=2.0))
+    np.testing.assert_allclose(lossy[1:].mean(), 2.5, rtol=1e-3)
+    ramped = np.repeat(time_s[:, None], 1, axis=1)
+    np.testing.assert_allclose(sensors.delayed(ramped, 0.123)[50:, 0], time_s[50:] - 0.123)
+
+
+def test_a_motor_draws_torque_over_its_constant_and_weakens_as_it_warms():
+    pull, rate = np.full((6000, 1, 1), 50.0), np.full((6000, 1, 1), 4.0)
+    motor = Motor(nm_per_a=2.0, friction_nm=1.0, inertia_kgm2=0.1)
+    current = sensors.currents_of(pull, pull, rate, np.array([0.2]), motor)[:, 0, 0]
+    np.testing.assert_allclose(current[0], (50.0 * 0.2 + 1.0) / 2.0, rtol=1e-6)
+    assert 1.0 < current[-1] / current[0] < 1.05
+    weak = sensors.currents_of(pull, pull, rate, np.array([0.2]), motor._replace(weak_ratio=0.2))
+    np.testing.assert_allclose(weak[0, 0, 0], current[0] / 0.8, rtol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", WORLDS, ids="_".join)
+def test_every_effect_shows_in_the_logs_of_its_world(place):
+    world = WORLDS[place]()
+    driven = driven_by(world, 2, np.random.default_rng(3), 4.0)
+
+    def values(shown):
+        runs = runs_of(shown, driven, np.random.SeedSequence(5))
+        return {name: stream.values for name, stream in runs[0].streams.items()}
+
+    plain = values(world)
+    for effect in effects_of(*place):
+        changed = values(effect.hide(world, effect.most))
+        apart = [name for name in plain if not np.array_equal(plain[name], changed[name], equal_nan=True)]
+        assert apart, effect.name
+        assert all(np.isfinite(each).all() for each in changed.values()), effect.name
+
+
+def test_names_of_answers_are_those_of_the_catalogue_or_of_what_it_lacks():
+    for place in WORLDS:
+        drive = load_robot(WORLDS[place]().robot).drive
+        names = {each.name for each in library_of(drive)}
+        inside = [bool({*effect.right} & names) for effect in effects_of(*place)]
+        assert sum(inside) >= 4
+        assert len(inside) - sum(inside) >= 4
+    every = {effect.name for place in WORLDS for effect in effects_of(*place)}
+    assert len(every) >= 20
+
+
+@pytest.mark.parametrize(
+    ("answer", "outcome"),
+    [
+        (Answer(causes=("payload",)), Outcome.RIGHT),
+        (Answer(causes=("motor_constant",)), Outcome.NEAREST),
+        (Answer(causes=("payload", "scrub")), Outcome.COMPANY),
+        (Answer(causes=("scrub",), candidates=("payload",)), Outcome.WRONG),
+        (Answer(sets=(("payload", "scrub"),)), Outcome.SET),
+        (Answer(sets=(("scrub", "lever_arm"),)), Outcome.WRONG),
+        (Answer(causes=("payload",), faults=("the gyro is in deg/s",)), Outcome.COMPANY),
+        (Answer(refusal="too few runs"), Outcome.WRONG),
+        (Answer(candidates=("scrub",)), Outcome.HONEST),
+        (Answer(unexplained=("current_a",)), Outcome.SILENT),  # known before anything was hidden
+        (Answer(unexplained=("speed_x_mps",)), Outcome.HONEST),
+        (Answer(), Outcome.SILENT),
+    ],
+)
+def test_an_answer_is_worth_what_the_physics_says(answer, outcome):
+    assert outcome_of(answer, ("payload",), ("motor_constant",), ("current_a",)) is outcome
+
+
+def test_trials_take_what_the_catalogue_has_and_what_it_lacks_in_turn():
+    cases = cases_of("plain_skid", 6, 1)
+    names = {each.name for each in library_of("skid_steer")}
+    right = {effect.name: {*effect.right} for effect in effects_of("plain", "skid")}
+    assert [bool(right[case.effect] & names) for case in cases] == [True, False] * 3
+    assert {case.world for case in cases_of("nothing", 8, 1)} >= {"skid", "car", "swerve", "omni"}
+
+
+def test_driven_wheels_begin_and_end_at_rest():
+    for place in WORLDS:
+        driven: Driven = driven_by(WORLDS[place](), 1, np.random.default_rng(0), 3.0)
+        assert not driven.rate[0].any()
