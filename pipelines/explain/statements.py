@@ -12,9 +12,10 @@ from pipelines.report.numbers import enumerated
 from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, Slope, off_by, rms_of, slopes_of
 from terrain.discrepancy.held_out import Gain
 from terrain.discrepancy.learner import Reference
+from terrain.discrepancy.patterns import Kind
 from terrain.discrepancy.robot_terms import UNITS, in_robot_terms, quantity, values_with_intervals
 from terrain.discrepancy.runs import TerrainMatch, measured_channels
-from terrain.discrepancy.verdict import Diagnosis, RuledOut, Varying
+from terrain.discrepancy.verdict import Diagnosis, RuledOut, Value, Varying
 from terrain.effects import PARAMETER, TRACKED, effect_named
 from terrain.robots import Robot
 
@@ -198,8 +199,7 @@ def verdict_text(diagnosis: Diagnosis) -> str:
         rivals = enumerated([effect_label(name) for name in names], "or")
         sentences.append(f"One of {rivals} is present, and these runs cannot distinguish them.")
     if diagnosis.varying:
-        varying = enumerated([effect_label(effect.name) for effect in diagnosis.varying])
-        sentences.append(f"The size of {varying} differs from run to run.")
+        sentences += [varying_text(effect) for effect in diagnosis.varying]
     if diagnosis.unexplained:
         channels = enumerated(
             [*dict.fromkeys(CHANNEL_WORDS[left.channel][0] for left in diagnosis.unexplained)]
@@ -252,18 +252,36 @@ def reference_text(reference: Reference) -> str:
 
 
 def varying_text(effect: Varying) -> str:
-    """Return how an effect differs from run to run, in a sentence or two."""
+    r"""Return how an effect differs from run to run, in a sentence or two.
+
+    Examples
+    --------
+    >>> about = "wheel_radius", "wheel_radius_ratio", "ratio", (), -0.035, 0.022, 10.2, (), "speed_x_mps"
+    >>> varying_text(Varying(*about, Kind.TREND, -0.07, (-0.072, -0.068), 20)).replace("\xa0", " ")
+    'The wheel radius falls by 7 % (6.8 to 7.2 %) over these 20 runs.'
+    """
     mean, scatter = (quantity(effect.parameter, value) for value in (effect.mean, effect.scatter))
-    text = (
-        f"The {effect_label(effect.name)} differs from run to run: {mean} on average, with a standard "
-        f"deviation of {scatter}."
-    )
-    parts = []
+    name, ends = effect_label(effect.name), sorted(map(abs, effect.change_ci))
+    if effect.name not in effect.parameter:
+        name = f"{name} ({PARAMETER[effect.parameter].label})"
+    by = values_with_intervals([Value(effect.parameter, abs(effect.change), effect.unit, *ends)])
+    rises, parts = effect.change > 0.0, []
     for value, _, runs in effect.groups:
         n, names = len(runs), ", ".join((*runs[:SHOWN_RUNS], *["..."] * (len(runs) > SHOWN_RUNS)))
         parts.append(f"{quantity(effect.parameter, value)} in {n} run{'s' * (n != 1)} ({names})")
-    if parts:
-        text += f" Two groups: {', and '.join(parts)}."
+    if effect.pattern is Kind.TREND:
+        text = f"The {name} {'rises' if rises else 'falls'} by {by} over these {effect.n_runs} runs."
+    elif effect.pattern is Kind.CHANGE:
+        first = effect.groups[1].runs[0]
+        text = f"The {name} {'rises' if rises else 'falls'} by {by} at one point of the order of the runs, {first}: "
+        text += f"{' and '.join(parts)}."
+    elif parts:
+        between = "sessions" if effect.pattern is Kind.SESSIONS else "two groups of runs"
+        text = f"The {name} differs between {between} by {by}: {enumerated(parts)}."
+    else:
+        text = (
+            f"The {name} differs from run to run: {mean} on average, with a standard deviation of {scatter}."
+        )
     if effect.rivals:
         rivals = enumerated([effect_label(rival) for rival in effect.rivals], "or")
         text += f" These runs do not distinguish that from {rivals}."

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -27,10 +27,11 @@ from terrain.discrepancy.evidence import (
     marginal_parts,
     z_of_t,
 )
-from terrain.discrepancy.robot_terms import value_in_robot_terms
-from terrain.discrepancy.runs import Signals
-from terrain.discrepancy.search import RIVAL_LINEAR, RIVAL_LOSS, CauseFit, Problem
-from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect
+from terrain.discrepancy.patterns import MIN_GROUP, SCATTERS, Kind, Pattern, pattern_of
+from terrain.discrepancy.robot_terms import value_in_robot_terms, values_with_intervals
+from terrain.discrepancy.runs import UNLIKE, Excluded, Signals
+from terrain.discrepancy.search import RIVAL_LINEAR, RIVAL_LOSS, CauseFit, Problem, cause_fit
+from terrain.effects import BOUNDS, CHANNELS, INDEX, PARAMETER, Effect
 from terrain.records import Array
 from terrain.robots import Robot
 
@@ -259,21 +260,18 @@ def agreement(value: Array, std: Array, dof: Array) -> tuple[float, float]:
     return p, math.sqrt(max(q - (k - 1), 0.0) / spread)
 
 
-# -- Effects whose size differs from run to run: how much, and whether the runs fall into two groups --------
+# -- Effects whose size differs from run to run: how much, and in which pattern ------------------------------
 # Runs are fitted with values of their own of one effect at a time, by a mixed model in which all else varies by
 # no more than is assumed.  The answer is the effect with the greatest likelihood: what half of the wheels do is
 # not the scatter of a track, though a scatter of the track that is estimated beside it would take most of it.
 #
-# Whether an effect varies is judged by the likelihood that is lost with one value for all runs.  The noise of a
-# run's value is that between the thirds of each run, since noise that lasts is in both.
+# Whether an effect varies is judged by the likelihood that is lost with one value for all runs, beyond what robots
+# are known to vary by, or by a pattern of the runs' values, which no such scatter makes
+# (:mod:`terrain.discrepancy.patterns`).  With a pattern, effects are compared with one value for each of its columns.
+# The noise of a run's value is that between the thirds of each run, since noise that lasts is in both.
 
 Z_VARIES = 4.5  #: Evidence of a difference between runs, as of a probe: of some thirty effects
 Z_NEAR = 3.0  #: Evidence of an effect that may be what varies instead of one whose evidence is enough
-
-TWO_GROUPS_RATIO = 0.15
-"""Part of the scatter that two groups leave: a uniform distribution, cut in its middle, leaves 0.25."""
-
-MIN_GROUP = 2  #: Least number of runs in a group
 
 OUT_STDS, OUT_SCATTERS, OUT_RATIO = 3.0, 0.25, 0.2
 """A run's value is out of its bounds by so many standard deviations and scatters, and the ratio of the runs
@@ -285,9 +283,6 @@ NEAR_RATIO, N_STEPS = 0.2, 3
 """Effects whose loss is behind by that ratio of the best one's gain are compared by nonlinear fits of so many
 steps: a run's own value may be far from where sensitivities were taken."""
 
-SCATTERS = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 40)])
-"""Scatters that are tried, over the range of the values."""
-
 
 class RunValues(NamedTuple):
     """Values (runs,) of a parameter by each run alone, and how far they scatter beyond the noise."""
@@ -296,7 +291,20 @@ class RunValues(NamedTuple):
     value: Array  #: over what the simulation has of it
     weight: Array  #: precision of each, 0 where a run shows nothing
     scatter: float
-    z: float
+    z: float  #: evidence of the scatter
+    variance: Array  #: of each by the noise alone, infinite where a run shows nothing
+    pattern: Pattern | None = None
+
+    @property
+    def evidence(self) -> float:
+        """Evidence that runs differ, as a standard normal number."""
+        return max(self.z, self.pattern.z if self.pattern else 0.0)
+
+    def in_pattern(self, signals: Sequence[Signals]) -> RunValues:
+        """Return the same with the pattern of the values of these runs."""
+        place, sessions = np.array([run.place for run in signals]), [run.session for run in signals]
+        place = place if np.isfinite(place).all() else np.arange(len(place), dtype=float)
+        return self._replace(pattern=pattern_of(self.value, self.variance, place, sessions))
 
 
 class _OwnValues(NamedTuple):
@@ -310,7 +318,7 @@ class _OwnValues(NamedTuple):
     @property
     def clearest(self) -> RunValues:
         """The parameter that differs most clearly."""
-        return max(self.runs, key=lambda runs: runs.z)
+        return max(self.runs, key=lambda runs: runs.evidence)
 
 
 def run_scatter(problem: Problem, fit: CauseFit, name: str) -> float:
@@ -335,10 +343,13 @@ def varying_effects(problem: Problem, fit: CauseFit) -> tuple[verdict.Varying, .
             values_by_run(info, p.name, fit.names, fit.change, least, known.get(p.name, 0.0))
             for p in effect.parameters
         ]
-        tried.append(_OwnValues(effect, runs, 0.0, 0.0))
-    if not max([own.clearest.z for own in tried]) > Z_VARIES:
+        tried.append(_OwnValues(effect, [own.in_pattern(problem.signals) for own in runs], 0.0, 0.0))
+    most = max(tried, key=lambda own: own.clearest.evidence)
+    if not most.clearest.evidence > Z_VARIES:
         return ()
-    tried = [_own_values(fit, info, own, known) for own in tried if own.clearest.z > Z_NEAR]
+    pattern = max([own.clearest.pattern for own in tried], key=lambda found: found.z if found else 0.0)
+    columns = pattern.columns[:, 1:] if pattern and pattern.z > Z_VARIES else np.zeros((len(info.rows), 0))
+    tried = [_own_values(fit, info, own, known, columns) for own in tried if own.clearest.evidence > Z_NEAR]
     first = min(tried, key=lambda own: own.loss)
     behind = max(RIVAL_LINEAR, NEAR_RATIO * first.gain)
     near: list[tuple[_OwnValues, _OwnValues]] = []
@@ -353,7 +364,8 @@ def varying_effects(problem: Problem, fit: CauseFit) -> tuple[verdict.Varying, .
                 for runs in own.runs
             }
             there = problem.at(info.origin, names, noise=info.noise, scatter=info.scatter, own=values)
-            own = _own_values(fit, there.counted_from(info.vector), own, known)
+            own = _own_values(fit, there.counted_from(info.vector), own, known, columns)
+        own = own._replace(runs=[runs.in_pattern(problem.signals) for runs in own.runs])
         of = own.clearest
         (low, high), seen = BOUNDS[of.name], of.weight > 0
         value = info.vector[INDEX[of.name]] + of.value[seen]
@@ -363,21 +375,51 @@ def varying_effects(problem: Problem, fit: CauseFit) -> tuple[verdict.Varying, .
     if not near:
         return ()
     best, straight = min(near, key=lambda pair: pair[0].loss)
-    # a mass makes more or less of the noise of the wheels, which a nonlinear fit counts: either may say so
+    # a mass makes more or less of the noise of the wheels, which a nonlinear fit counts: either may say so, unless
+    # values of a pattern are so far from where sensitivities were taken that nothing else explains it
     alike = [
-        own for own, linear in near if min(own.loss - best.loss, linear.loss - straight.loss) < RIVAL_LOSS
+        own
+        for own, linear in near
+        if own.loss - best.loss < RIVAL_LOSS
+        or (not columns.size and linear.loss - straight.loss < RIVAL_LOSS)
     ]
-    if not max([own.clearest.z for own in alike]) > Z_VARIES:
+    if not max([own.clearest.evidence for own in alike]) > Z_VARIES:
         return ()
     of, rivals = best.clearest, tuple([own.effect.name for own in alike if own is not best])
     name, mean = best.effect.name, float(np.average(of.value, weights=of.weight))
     channel = CHANNELS[int(np.argmax(info.channel_power(np.eye(len(info.names))[info.places([of.name])])))]
-    about = of.name.rpartition("_")[2], rivals, mean, of.scatter, of.z
-    return (verdict.Varying(name, of.name, *about, _two_groups(of, [r.run_id for r in info.rows]), channel),)
+    about = of.name.rpartition("_")[2], rivals, mean, of.scatter, of.evidence
+    return (verdict.Varying(name, of.name, *about, *_in_words(of, problem.signals, channel)),)
 
 
-def _own_values(fit: CauseFit, info: Evidence, tried: _OwnValues, known: Mapping[str, float]) -> _OwnValues:
-    """Fit runs with values of their own of an effect, all else as it is assumed, from a scatter of its parameters."""
+def rogue_run(varying: Sequence[verdict.Varying]) -> Excluded | None:
+    """Return the run whose value is unlike that of all others, with what it is unlike in; None where there is none."""
+    for effect in varying:
+        if effect.pattern is Kind.ROGUE:
+            others, own = effect.groups
+            low, high = effect.change_ci
+            value = verdict.Value(effect.parameter, effect.change, effect.unit, low, high)
+            reason = f"its {PARAMETER[effect.parameter].label} differs from theirs by {values_with_intervals([value])}"
+            return Excluded(own.runs[0], f"{UNLIKE} {len(others.runs)} runs: {reason}")
+    return None
+
+
+def unlike_in(problem: Problem, fit: CauseFit, run: Signals) -> Excluded | None:
+    """Return what a run beside those of a fit is unlike them in; None where that is no one value."""
+    both = problem._replace(signals=(*problem.signals, run))
+    info = both.at(fit.info.origin, noise=fit.info.noise, scatter=fit.info.scatter)
+    info = info.counted_from(fit.info.vector)
+    found = rogue_run(varying_effects(both, cause_fit(both, info, fit.causes)))
+    return found if found is not None and found.run_id == run.run_id else None
+
+
+def _own_values(
+    fit: CauseFit, info: Evidence, tried: _OwnValues, known: Mapping[str, float], columns: Array
+) -> _OwnValues:
+    """Fit runs with values of their own of an effect, all else as it is assumed, from a scatter of its parameters.
+
+    With the columns (runs, m) of a pattern, the effect has a value for each of these, and scatters about them.
+    """
     own = [runs.name for runs in tried.runs]
     names = tuple(dict.fromkeys([*fit.names, *own]))
     least = {
@@ -387,11 +429,25 @@ def _own_values(fit: CauseFit, info: Evidence, tried: _OwnValues, known: Mapping
     least_std, q = np.array([*least.values()]), len(least) - len(own)
     free = np.arange(len(least)) >= q
     start = np.concatenate([least_std[:q], [runs.scatter for runs in tried.runs]])
-    model = info.grams.sum(axis=1), info.places(names), info.places([*least]), least_std
-    loss, shared, std = fit_mixed(*model, start, free)
-    alike = fit_mixed(*model, least_std, np.zeros_like(free))[0]
+    if columns.size:  # what robots differ by at random makes no pattern
+        least_std = np.concatenate([least_std[:q], [LEAST_RATIO * PRIOR_STD[name] for name in own]])
+    gram, n, k = info.grams.sum(axis=1), len(info.rows), len(info.names)
+    # the columns of the evidence, a parameter's own for each column of the pattern, and the residual
+    design = np.zeros((n, k + 1, k + len(own) * columns.shape[1] + 1))
+    design[:, np.arange(k), np.arange(k)] = design[:, -1, -1] = 1.0
+    for j, place in enumerate(info.places(own)):
+        first = k + j * columns.shape[1]
+        design[:, place, first : first + columns.shape[1]] = columns
+    gram = design.transpose(0, 2, 1) @ gram @ design
+    both = [*info.places(names), *range(k, design.shape[2] - 1)]
+    loss, shared, std = fit_mixed(gram, both, info.places([*least]), least_std, start, free)
+    alike = fit_mixed(
+        gram, info.places(names), info.places([*least]), least_std, least_std, np.zeros_like(free)
+    )[0]
     varies = dict(zip(least, std.tolist(), strict=True))
-    runs = [values_by_run(info, name, names, shared, varies, known.get(name, 0.0)) for name in own]
+    runs = [
+        values_by_run(info, name, names, shared[: len(names)], varies, known.get(name, 0.0)) for name in own
+    ]
     return _OwnValues(tried.effect, runs, loss, alike - loss)
 
 
@@ -421,21 +477,23 @@ def values_by_run(
     total = weight.sum(axis=1)
     seen = total > 1e-6 * max(float(total.max()), 1e-30)
     if seen.sum() < 2 * MIN_GROUP or not total.max() > 0:
-        return RunValues(name, np.zeros(len(total)), np.ones(len(total)), 0.0, 0.0)
+        nothing = np.full(len(total), math.inf)
+        return RunValues(name, np.zeros(len(total)), np.ones(len(total)), 0.0, 0.0, nothing)
     value = np.where(seen, score.sum(axis=1) / np.where(seen, total, 1.0), 0.0)
     use = seen[:, None] & (weight > 0.05 * total[:, None])
     apart = (score - weight * value[:, None]) ** 2 / np.where(use, weight, 1.0)
     inside, dof = float(apart[use].sum()), int(np.maximum(use.sum(axis=1) - 1, 0).sum())
     # thirds of a run share its deviations, most of the variance of a short one: no less than by whitening
     noise = max((TRUST_DOF + inside) / (TRUST_DOF + dof), 1.0)
-    precision = np.where(seen, 1.0 / (noise / np.where(seen, total, 1.0) + assumed_std**2), 0.0)
+    variance = np.where(seen, noise / np.where(seen, total, 1.0), math.inf)
+    precision = 1.0 / (variance + assumed_std**2)
     # one run that is far out is no variation from run to run: the others have to differ as well
     known = np.flatnonzero(seen)
     likelihood = math.inf  # that a scatter of their own gains, twice its logarithm
     for rest in [np.delete(known, i) for i in range(len(known))]:
-        variance = 1.0 / precision[rest] + (SCATTERS[:, None] * np.ptp(value[rest])) ** 2
-        middle = (value[rest] / variance).sum(axis=1) / (1.0 / variance).sum(axis=1)
-        loss = (np.log(variance) + (value[rest] - middle[:, None]) ** 2 / variance).sum(axis=1)
+        var = 1.0 / precision[rest] + (SCATTERS[:, None] * np.ptp(value[rest])) ** 2
+        middle = (value[rest] / var).sum(axis=1) / (1.0 / var).sum(axis=1)
+        loss = (np.log(var) + (value[rest] - middle[:, None]) ** 2 / var).sum(axis=1)
         likelihood = min(likelihood, float(loss[0] - loss.min()))
     z = z_of_t(math.sqrt(max(likelihood, 0.0)), TRUST_DOF + dof)
     # squares about the mean, in variances, those far out limited
@@ -443,28 +501,30 @@ def values_by_run(
     square = np.minimum(square, 9.0 * max(float(np.median(square[precision > 0])), 1.0))
     beyond = float(square.sum()) - (len(known) - 1)
     spread = float(precision.sum() - (precision**2).sum() / precision.sum())
-    return RunValues(name, value + mean, precision, math.sqrt(max(beyond / spread, 0.0) + assumed_std**2), z)
+    beyond_noise = math.sqrt(max(beyond / spread, 0.0) + assumed_std**2)
+    return RunValues(name, value + mean, precision, beyond_noise, z, variance)
 
 
-def _two_groups(best: RunValues, run_ids: Sequence[str]) -> tuple[verdict.RunGroup, ...]:
-    """Return two groups of runs, if values fall into two; none if they do not."""
-    order = [i for i in np.argsort(best.value, kind="stable") if best.weight[i] > 0]
-    value, weight = best.value[order], best.weight[order]
-
-    def square(part: slice) -> float:
-        v, w = value[part], weight[part]
-        return float((w * (v - np.average(v, weights=w)) ** 2).sum())
-
-    cuts = range(MIN_GROUP, len(order) - MIN_GROUP + 1)
-    left = {k: square(slice(0, k)) + square(slice(k, None)) for k in cuts}
-    cut = min(left, key=lambda k: left[k], default=0)
-    if not cut or max(left[cut] - (len(order) - 2), 0.0) > TWO_GROUPS_RATIO * square(slice(None)):
-        return ()
-    groups = []
-    for part in (slice(0, cut), slice(cut, None)):
-        mean, std = np.average(value[part], weights=weight[part]), 1.0 / math.sqrt(weight[part].sum())
-        groups.append(verdict.RunGroup(float(mean), std, tuple(sorted([run_ids[i] for i in order[part]]))))
-    return tuple(groups)
+def _in_words(of: RunValues, signals: Sequence[Signals], channel: str) -> tuple[Any, ...]:
+    """Return the last fields of a :class:`verdict.Varying`: groups, channel, pattern and what it changes by."""
+    found = of.pattern
+    if found is None or not found.z > (Z_NEAR if of.z > Z_VARIES else Z_VARIES):
+        return (), channel
+    if found.kind is Kind.TREND:
+        span = float(np.ptp(found.columns[:, 1]))
+        return (), channel, found.kind, *found.at(np.array([0.0, span])), round(span) + 1
+    # of two groups the smaller value first, of a change what was before, of a rogue the others
+    order, groups = range(len(found.coefficients)), []
+    if found.kind in (Kind.GROUPS, Kind.SESSIONS):
+        order = np.argsort(found.coefficients, kind="stable").tolist()
+    for k in order:
+        mine = np.flatnonzero((found.columns[:, k] > 0) & np.isfinite(of.variance))
+        std = math.sqrt(float(found.cov[k, k]))
+        runs = tuple(signals[i].run_id for i in mine.tolist())
+        groups.append(verdict.RunGroup(float(found.coefficients[k]), std, runs))
+    apart = np.zeros(len(found.coefficients))
+    apart[order[-1]], apart[order[0]] = 1.0, -1.0
+    return tuple(groups), channel, found.kind, *found.at(apart)
 
 
 # -- Linear mixed model of runs: parameters that all runs share, and such of which each run has its own value --

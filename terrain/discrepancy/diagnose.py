@@ -24,6 +24,7 @@ from terrain.discrepancy.next_drive import MOST, next_drive
 from terrain.discrepancy.probes import TILT_INPUTS, ProbeResult, probe_residuals
 from terrain.discrepancy.robot_terms import UNITS
 from terrain.discrepancy.runs import (
+    UNLIKE,
     Excluded,
     Signals,
     Simulation,
@@ -45,6 +46,8 @@ BLIND_RATIO = 0.05
 
 Z_CANDIDATE = 3.5
 """Evidence below the threshold that makes an effect a candidate: 5e-4, one in a hundred of a library of 26."""
+
+MAX_UNLIKE = 5  #: Most runs that are unlike the others for which it is asked what they are unlike in
 
 MAX_WITHDRAWN = 6  #: Most causes that are withdrawn one after the other
 
@@ -112,12 +115,21 @@ def diagnose(
     if not any(np.nanmax(np.abs(run.wheel_speed_mps), initial=0.0) > REST_MPS for run in fit_runs):
         raise DataError(f"runs: in all {len(fit_runs)} the wheels are at rest; runs that drive are required")
 
-    # causes, their values and what they leave
-    problem = constancy.with_conditions(prepared, aligned)
-    start = aligned if problem is prepared and not seeds else problem.at(simulation.vector)
-    withdrawn: dict[str, verdict.Cause] = {}
-    fit = _withdraw_wrong(problem, search(problem, start, seeds), withdrawn)
-    varying = constancy.varying_effects(problem, fit)
+    # causes, their values and what they leave, without runs of which one value is unlike that of all others
+    while True:
+        problem = constancy.with_conditions(prepared, aligned)
+        start = aligned if problem is prepared and not seeds else problem.at(simulation.vector)
+        withdrawn: dict[str, verdict.Cause] = {}
+        fit = _withdraw_wrong(problem, search(problem, start, seeds), withdrawn)
+        varying = constancy.varying_effects(problem, fit)
+        rogue = constancy.rogue_run(varying)
+        if rogue is None or len(prepared.signals) <= MIN_RUNS:
+            break
+        excluded = (*excluded, rogue)
+        rest = tuple([run for run in prepared.signals if run.run_id != rogue.run_id])
+        prepared = prepared._replace(signals=rest)
+        aligned = prepared.at(aligned.origin)
+        shift = shifts_of(aligned)
     varies = {name for effect in varying for name in (effect.name, *effect.rivals)}
     others = [cause for cause in fit.causes if cause.name not in varies]
     if varying and varying[0].parameter not in problem.scatter and others:
@@ -128,6 +140,10 @@ def diagnose(
         fit = _withdraw_wrong(problem, refit(problem, info, again), withdrawn)
     fit = _withdraw_varying(problem, fit, varies, withdrawn)
     fit = pooled(problem, fit._replace(rivals=rivals_of(problem, fit.info, start, fit.causes)))
+    by_id = {run.run_id: run for run in repaired(signals, faults)}
+    unlike = [run.run_id for run in excluded if run.reason.startswith(UNLIKE)][:MAX_UNLIKE]
+    named_in = {run_id: constancy.unlike_in(problem, fit, by_id[run_id]) for run_id in unlike}
+    excluded = tuple([named_in.get(run.run_id) or run for run in excluded])
 
     # channels that depend on an input, the most significant of each, or on a cause that was withdrawn
     best: dict[str, verdict.Unexplained] = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ from terrain.discrepancy.runs import (
     Signals,
     Simulation,
     TerrainMatch,
+    in_order,
     low_pass_of,
     signals_of,
 )
@@ -94,9 +95,10 @@ def diagnose_runs(
     DataError
         if runs are too few, or cannot be compared with the simulation.
     """
-    runs = [with_wheel_speeds(run, robot) for run in sorted(runs, key=lambda run: run.run_id)]
+    runs = [with_wheel_speeds(run, robot) for run in in_order(runs)]
+    place = {run.run_id: float(k) for k, run in enumerate(runs)}
     used, held_out = split_runs(runs, hold_out, seed)
-    every = {run.run_id: signals_of(run, robot) for run in used}
+    every = {run.run_id: replace(signals_of(run, robot), place=place[run.run_id]) for run in used}
     simulation, terrains = simulation_for(used, robot, library, [*every.values()])
     diagnosis = diagnose(used, simulation, library, [*every.values()] if len(every) == len(used) else None)
     # ambiguous sets are left out: which of their effects acts is not known

@@ -8,8 +8,10 @@ prediction contains the noise of a differentiated encoder, which otherwise looks
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -165,6 +167,7 @@ class Signals:
     #: (n, len(CHANNELS)) what the simulation is compared with; NaN where nothing was measured
     measured: Array
     session: str = ""  #: that the run is part of; empty where that is not known
+    place: float = math.nan  #: in the order in which runs were driven, from 0; NaN: as they are given
 
     def __len__(self) -> int:
         return len(self.measured)
@@ -175,11 +178,37 @@ class Signals:
         return self.start_s + self.dt_s * np.arange(len(self))
 
 
+UNLIKE = "it is unlike the other"  #: How the reason begins of a run whose robot or terrain is not that of the others
+
+
 class Excluded(NamedTuple):
     """A run that is excluded from the comparison, and why."""
 
     run_id: str
     reason: str
+
+
+def in_order(runs: Sequence[RunLog]) -> list[RunLog]:
+    """Return runs in the order in which they were driven, as far as it is known.
+
+    That is by their stamps where these are of one clock, on which no two runs overlap; else by their ids, numbers in
+    these by size.
+
+    Examples
+    --------
+    >>> from terrain.records import Stream
+    >>> imu = Stream(np.arange(3.0), np.zeros((3, 0)), ())
+    >>> [run.run_id for run in in_order([RunLog(name, "husky", {"imu": imu}) for name in ("r_10", "r_2")])]
+    ['r_2', 'r_10']
+    """
+
+    def parts(run: RunLog) -> list[tuple[int, str]]:
+        return [(int(x), "") if x.isdecimal() else (-1, x) for x in re.split(r"(\d+)", run.run_id)]
+
+    by_id = sorted(runs, key=parts)
+    by_time = sorted(by_id, key=lambda run: run.start_s)
+    on_one_clock = all(before.end_s <= after.start_s for before, after in pairwise(by_time))
+    return by_time if on_one_clock else by_id
 
 
 def comparable(runs: Sequence[RunLog], robot: Robot) -> tuple[tuple[Signals, ...], tuple[Excluded, ...]]:

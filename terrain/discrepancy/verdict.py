@@ -5,12 +5,14 @@ The fields of these records are the keys of ``terrain explain --json``.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
 
 from terrain.discrepancy.health.fault import Fault
 from terrain.discrepancy.health.unfit import Clock
+from terrain.discrepancy.patterns import Kind
 from terrain.discrepancy.runs import Excluded
 from terrain.records import Array
 
@@ -96,8 +98,15 @@ class Varying(NamedTuple):
     scatter: float
     z: float  #: evidence of the difference, as a standard normal number
     groups: tuple[RunGroup, ...]
-    """Two groups of runs, the smaller value first; empty where values are spread."""
+    """Runs by what they have in common: of two groups and of sessions the smaller value first, of a change that before
+    it, of a rogue run the others; empty for a trend, and where values are spread."""
     channel: str  #: where it shows most
+    pattern: Kind = Kind.SPREAD
+    change: float = math.nan
+    """From the first run to the last along a trend, else from the first of the groups to the last; NaN without a
+    pattern."""
+    change_ci: tuple[float, float] = (math.nan, math.nan)  #: its 95 % interval
+    n_runs: int = 0  #: from the first of the order to the last, those between that were not compared counted
 
 
 class SessionValue(NamedTuple):

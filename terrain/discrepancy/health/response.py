@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from terrain.discrepancy.health.agreement import LEAST, MOTION, Agreement, G, H, X, Y, medians
-from terrain.discrepancy.runs import Rows, Signals
+from terrain.discrepancy.runs import UNLIKE, Rows, Signals
 from terrain.records import Array
 from terrain.signals import true_stretches
 
@@ -153,6 +153,6 @@ def odd_runs(runs: Sequence[Rows], follows: Agreement, among: Sequence[int]) -> 
             far = np.flatnonzero(np.abs(off) > np.maximum(sigmas * np.hypot(scatter, error), LEAST_OFF))
             for k in far if len(far) <= MAX_ODD_RATIO * len(places) else ():
                 text = f"its {name} is {math.exp(off[k]):.2f} times what they make of the same wheels"
-                reason = f"it is unlike the other runs: {text}, and they scatter by {scatter:.0%}"
+                reason = f"{UNLIKE} runs: {text}, and they scatter by {scatter:.0%}"
                 reasons.setdefault(places[k], reason)
     return reasons

@@ -26,7 +26,7 @@ from terrain.discrepancy.health.agreement import (
     on_own_clocks,
 )
 from terrain.discrepancy.health.response import FOLLOWS, STRETCH_S, common_gains, odd_runs, stalled_runs
-from terrain.discrepancy.runs import Excluded, Rows, Signals
+from terrain.discrepancy.runs import UNLIKE, Excluded, Rows, Signals
 from terrain.effects import CHANNELS, INDEX
 from terrain.records import Array
 from terrain.signals import true_stretches
@@ -207,7 +207,7 @@ def _unlike(info: Evidence, among: Sequence[int]) -> dict[int, str]:
             if not (ratio[worst] > UNLIKE_RATIO and noise_ratio > UNLIKE_NOISE_RATIO):
                 break
             reasons[left.pop(worst)] = (
-                f"it is unlike the other runs: in common with them it fits {ratio[worst]:.0f} times worse than "
+                f"{UNLIKE} runs: in common with them it fits {ratio[worst]:.0f} times worse than "
                 "they do among themselves"
             )
     return reasons

@@ -12,6 +12,7 @@ from terrain.discrepancy import verdict
 from terrain.discrepancy.diagnosed_runs import HeldOutGain
 from terrain.discrepancy.held_out import Change, ChannelGain, Comparison, Gain
 from terrain.discrepancy.learner import ChannelReference, Reference
+from terrain.discrepancy.patterns import Kind
 from terrain.discrepancy.runs import Excluded, measured_channels
 from terrain.discrepancy.verdict import Clock
 from terrain.robots import load_robot
@@ -87,7 +88,8 @@ RIVALS = {
 }
 GROUPS = verdict.RunGroup(0.0, 0.01, ("a", "b")), verdict.RunGroup(0.3, 0.01, tuple("cdefgh"))
 PAYLOAD = verdict.Varying(
-    "payload", "payload_ratio", "ratio", ("scrub",), 0.1, 0.14, 9.0, GROUPS, "current_a"
+    *("payload", "payload_ratio", "ratio", ("scrub",), 0.1, 0.14, 9.0, GROUPS, "current_a"),
+    *(Kind.GROUPS, 0.3, (0.26, 0.34)),
 )
 LEFT = (
     verdict.Unexplained("current_a", "wheel 1 turn", 12.34, 0.2),
@@ -129,8 +131,8 @@ LEFT = (
                 "A clock rate of any size that is likely (up to 2 %) would not have been detected.",
                 "An effective track off by under 4.8 % would not have been detected.",
                 "scrub The runs show nothing of it. 0.4",
-                "10 % on average, with a standard deviation of 14 %. Two groups: 0 % in 2 runs (a, b), and 30 % in 6 "
-                "runs (c, d, e, f, g, ...). These runs do not distinguish that from scrub.",
+                "The payload differs between two groups of runs by 30 % (26 to 34 %): 0 % in 2 runs (a, b) and 30 % "
+                "in 6 runs (c, d, e, f, g, ...). These runs do not distinguish that from scrub.",
             ),
         ),
         (

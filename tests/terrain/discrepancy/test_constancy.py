@@ -23,6 +23,7 @@ from terrain.discrepancy.constancy import (
 )
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.evidence import Evidence, grams_of
+from terrain.discrepancy.patterns import Kind
 from terrain.discrepancy.verdict import Tier
 from terrain.effects import PARAMETERS, effect_named
 from terrain.robots import load_robot
@@ -224,15 +225,33 @@ def test_half_of_the_runs_are_a_group_and_that_is_the_answer(runs):
     assert abs(other.value - 0.06) < 4 * other.std < 0.012
 
 
-def test_a_spread_that_is_even_has_no_groups_and_runs_that_are_alike_and_one_rogue_do_not_vary(varying):
-    values = np.linspace(-0.03, 0.09, N_RUNS)
+def test_a_spread_in_no_order_has_no_groups_and_runs_that_are_alike_do_not_vary(varying):
+    values = np.linspace(-0.03, 0.09, N_RUNS)[[3, 6, 1, 4, 0, 7, 2, 5]]
     (effect,), fit, problem = varying(values)
-    assert (effect.name, effect.groups) == ("wheel_radius", ())
+    assert (effect.name, effect.groups, effect.pattern) == ("wheel_radius", (), Kind.SPREAD)
     assert effect.scatter == pytest.approx(np.std(values, ddof=1), rel=0.3)
     assert run_scatter(problem, fit, RADIUS) == pytest.approx(effect.scatter, rel=0.02)
     assert run_scatter(problem, fit, "camera_yaw_rad") < 0.01
-    for alike in (np.full(N_RUNS, 0.06), 0.06 * (np.arange(N_RUNS) == 3)):
-        assert varying(alike)[0] == ()
+    assert varying(np.full(N_RUNS, 0.06))[0] == ()
+
+
+def test_a_tyre_that_loses_air_is_a_trend_in_its_size_and_one_rogue_run_is_named_and_left_out(runs):
+    library = tuple(map(effect_named, MIXED))
+    losing = runs(-0.07 * np.arange(N_RUNS) / (N_RUNS - 1))
+    (effect,) = diagnose(losing, SIMULATION, library).varying
+    assert (effect.name, effect.pattern, effect.n_runs, effect.groups) == (
+        "wheel_radius",
+        Kind.TREND,
+        N_RUNS,
+        (),
+    )
+    low, high = effect.change_ci
+    assert effect.change == pytest.approx(-0.07, rel=0.2)
+    assert low < -0.07 < high < -0.05
+    rogue = diagnose(with_rogue := runs(0.08 * (np.arange(N_RUNS) == 3)), SIMULATION, library)
+    (out,) = rogue.excluded_runs
+    assert (rogue.varying, out.run_id) == ((), with_rogue[3].run_id)
+    assert "unlike the other 7 runs: its wheel radius differs from theirs by 8" in out.reason
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,137 @@
+"""How a value differs between runs: by a trend or a change in their order, in two groups, by session, or in one run.
+
+Runs have values ``v_i`` with variances ``s_i^2`` by the noise.  A pattern is a design ``X`` with
+
+    v = X b + e,   e_i ~ N(0, s_i^2 + t^2),
+
+and the scatter ``t`` of greatest likelihood.  Its evidence over one value of all runs is the likelihood ratio as an F
+statistic, which it is where the scatter is far above the noise, and which understates it elsewhere; the probability is
+multiplied by the number of patterns of its kind (Bonferroni), as two groups may be any.  The runs themselves show their
+scatter: what robots of a kind differ by from run to run is not asked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import gammaln
+from scipy.stats import f as fisher
+from scipy.stats import t as student
+
+from terrain.discrepancy.evidence import z_of
+from terrain.records import Array
+
+MIN_RUNS, MIN_SIDE, MIN_GROUP = 6, 3, 2
+"""Least number of runs, of runs on either side of a change and in a session, and of runs in a group."""
+
+SCATTERS = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 40)])
+"""Scatters that are tried, over the range of the values."""
+
+
+class Kind(StrEnum):
+    """How a value differs from run to run."""
+
+    SPREAD = "spread"  #: at random
+    TREND = "trend"  #: in proportion to the place in the order of the runs
+    CHANGE = "change"  #: one value up to a run, and another from the next
+    GROUPS = "groups"  #: one of two values
+    SESSIONS = "sessions"  #: one value a session
+    ROGUE = "rogue"  #: one run has another value than the rest
+
+
+class Pattern(NamedTuple):
+    """A pattern, and its values."""
+
+    kind: Kind
+    z: float  #: evidence over one value of all runs, as a standard normal number
+    columns: Array  #: (n, m) design: of a trend 1 and the place, else which part a run is in
+    coefficients: Array  #: (m,) of a trend the value at place 0 and its growth, else by part
+    cov: Array
+    dof: int  #: of the scatter
+
+    @property
+    def values(self) -> Array:
+        """The values (n,) that it gives runs."""
+        return np.asarray(self.columns @ self.coefficients)
+
+    def at(self, combination: Array) -> tuple[float, tuple[float, float]]:
+        """Return a combination (m,) of the coefficients, and its 95 % interval."""
+        value = float(combination @ self.coefficients)
+        half = float(student.ppf(0.975, self.dof)) * math.sqrt(float(combination @ self.cov @ combination))
+        return value, (value - half, value + half)
+
+
+def pattern_of(value: Array, variance: Array, place: Array, session: Sequence[str]) -> Pattern | None:
+    """Return the pattern with the greatest evidence; None for too few runs, or values that do not differ.
+
+    Parameters
+    ----------
+    value, variance : (n,) by run, the variance by the noise infinite where a run shows nothing
+    place : (n,) of the runs in their order
+    session : (n,) of the runs by name, empty where that is not known
+
+    Examples
+    --------
+    >>> noise, place = 0.001 * np.random.default_rng(0).standard_normal(20), np.arange(20.0)
+    >>> trend = pattern_of(noise - 0.004 * place, np.full(20, 1e-6), place, [""] * 20)
+    >>> str(trend.kind), trend.z > 6.0, pattern_of(noise, np.full(20, 1e-6), place, [""] * 20).z < 4.0
+    ('trend', True, True)
+    """
+    known = np.isfinite(variance)
+    v, s2, at, n = value[known], variance[known], place[known], int(known.sum())
+    if n < MIN_RUNS or not np.ptp(v) > 0.0:
+        return None
+    loss, _, _, weight = _fit(v, s2, np.ones((n, 1)))
+    off = v - np.average(v, weights=weight)
+    cuts, sizes = np.unique(at)[MIN_SIDE : 1 - MIN_SIDE], np.arange(MIN_GROUP, n - MIN_GROUP + 1)
+    cuts_value = np.sort(v)[sizes]
+    choices = gammaln(n + 1) - gammaln(sizes + 1) - gammaln(n - sizes + 1) + math.log(sizes.size)
+    # of each kind which runs are in the second part, on all runs, and the logarithm of how many there are
+    parts = [
+        (Kind.CHANGE, place >= cuts[:, None], np.full(cuts.size, math.log(cuts.size))),
+        (Kind.GROUPS, (value >= cuts_value[:, None]) & known, choices),
+        (Kind.ROGUE, np.eye(len(value), dtype=bool)[known], np.full(n, math.log(n))),
+    ]
+    designs = [(Kind.TREND, np.column_stack([np.ones_like(place), place]), 0.0)] * bool(np.ptp(at) > 0.0)
+    for kind, second, log_choices in parts:
+        own = second[:, known] - (second[:, known] @ weight / weight.sum())[:, None]
+        square = (own @ (weight * off)) ** 2 / np.maximum(own**2 @ weight, 1e-30)
+        left = 1.0 - square / (weight @ off**2)
+        k = int(np.argmin(0.5 * n * np.log(np.maximum(left, 1e-12)) + log_choices))
+        designs.append((kind, np.column_stack([~second[k], second[k]]).astype(float), float(log_choices[k])))
+    names = sorted(set(session))
+    if (
+        len(names) > 1
+        and min([sum(known[i] for i, own in enumerate(session) if own == name) for name in names]) >= MIN_SIDE
+    ):
+        designs.append(
+            (Kind.SESSIONS, np.array([[own == name for name in names] for own in session], float), 0.0)
+        )
+    best: Pattern | None = None
+    for kind, columns, log_choice in designs:
+        own_loss, coefficients, cov, _ = _fit(v, s2, columns[known])
+        more, dof = columns.shape[1] - 1, n - columns.shape[1]
+        ratio = max(loss - own_loss, 0.0) / n
+        log_p = float(fisher.logsf(math.expm1(min(ratio, 500.0)) * dof / more, more, dof))
+        # where that underflows: far out the tail falls with this power
+        z = z_of(min(max(log_p, -0.5 * dof * ratio - 50.0) + log_choice, 0.0))
+        if best is None or z > best.z:
+            best = Pattern(kind, z, columns, coefficients, cov, dof)
+    return best
+
+
+def _fit(value: Array, variance: Array, columns: Array) -> tuple[float, Array, Array, Array]:
+    """Return minus twice the log-likelihood of a design, its coefficients, their covariance, and the runs' weights."""
+    weights = 1.0 / (variance + (SCATTERS[:, None] * np.ptp(value)) ** 2)
+    covs = np.linalg.pinv(np.einsum("tn,ni,nj->tij", weights, columns, columns), hermitian=True)
+    xs = np.einsum("tij,nj,tn->ti", covs, columns, weights * value)
+    losses = (weights * (value - xs @ columns.T) ** 2 - np.log(weights)).sum(axis=1)
+    k = int(np.argmin(losses))
+    x, weight, dof = xs[k], weights[k], len(value) - columns.shape[1]
+    # of greatest likelihood, the scatter is too small by what was fitted
+    inflation = max(float(weight @ (value - columns @ x) ** 2) / dof, 1.0)
+    return float(losses[k]), x, covs[k] * inflation, weight

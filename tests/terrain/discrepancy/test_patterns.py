@@ -1,0 +1,55 @@
+"""Patterns of values by run: each is recognised with its size, and none is seen in values that differ at random."""
+
+import numpy as np
+import pytest
+
+from terrain.discrepancy.patterns import Kind, pattern_of
+
+N = 20
+PLACE, NO_SESSION = np.arange(float(N)), [""] * N
+SESSIONS = ["c", "a", "b", "a", "c"] * 4
+IN_GROUP = np.random.default_rng(3).permutation(N) % 2
+SHAPES = {
+    Kind.TREND: (-0.07 * PLACE / (N - 1), NO_SESSION, -0.07 / (N - 1)),
+    Kind.CHANGE: (0.05 * (PLACE >= 13), NO_SESSION, 0.05),
+    Kind.GROUPS: (0.05 * IN_GROUP, NO_SESSION, 0.05),
+    Kind.ROGUE: (-0.06 * (PLACE == 7), NO_SESSION, -0.06),
+    Kind.SESSIONS: (np.array([{"a": 0.0, "b": 0.02, "c": 0.05}[name] for name in SESSIONS]), SESSIONS, 0.02),
+}
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_each_pattern_is_recognised_with_its_size_and_runs_that_show_nothing_do_not_count(kind):
+    shape, sessions, size = SHAPES[kind]
+    rng, covered = np.random.default_rng(1), 0
+    for _ in range(40):
+        std = 0.002 * np.exp(0.3 * rng.standard_normal(N))
+        value = shape + 0.003 * rng.standard_normal(N) + std * rng.standard_normal(N)
+        std[4], value[4] = np.inf, 9.0
+        found = pattern_of(value, std**2, PLACE, sessions)
+        assert (found.kind, found.z > 4.5) == (kind, True)
+        step = np.zeros(len(found.coefficients))
+        step[1], step[0] = 1.0, 0.0 if kind is Kind.TREND else -1.0
+        change, (low, high) = found.at(step)
+        assert change == pytest.approx(size, rel=0.35)
+        covered += low <= size <= high
+    assert covered >= 33  # of 40, where 95 % hold it
+
+
+@pytest.mark.parametrize("n", [6, 12, 40])
+@pytest.mark.parametrize("noise", [0.01, 1.0, 30.0])
+def test_values_that_differ_at_random_have_no_pattern(n, noise):
+    """Of five kinds, each at a probability that counts all its members."""
+    rng, z = np.random.default_rng(n), []
+    for _ in range(150):
+        std = noise * np.exp(0.3 * rng.standard_normal(n))
+        value = rng.standard_normal(n) + std * rng.standard_normal(n)
+        z.append(pattern_of(value, std**2, np.arange(float(n)), ["a", "b"] * (n // 2)).z)
+    assert np.mean(np.array(z) > 2.0) < 5 * 0.046 + 0.07
+    assert max(z) < 4.5
+
+
+def test_few_runs_or_values_that_are_all_alike_have_no_pattern():
+    assert pattern_of(PLACE[:5], np.ones(5), PLACE[:5], [""] * 5) is None
+    assert pattern_of(np.zeros(N), np.ones(N), PLACE, NO_SESSION) is None
+    assert pattern_of(PLACE, np.full(N, np.inf), PLACE, NO_SESSION) is None
