@@ -6,7 +6,8 @@ and of turning, which filters do not model.  Whoever reads a run and its robot c
 
     run, robot = correct(run, robot)
 
-and filters take what is corrected.  A live chain gives its estimator the robot and the
+and filters take what is corrected.  A learned term (:mod:`terrain.learned_term`) of the motion is corrected alike, in
+the wheels' samples.  A live chain gives its estimator the robot and the
 :class:`Correction` of :func:`correct_live`.  Where a description lacks the section of a home, samples are
 corrected instead if the effect has an inverse.
 """
@@ -37,7 +38,8 @@ from terrain.effects import (
 )
 from terrain.errors import ConfigError, OutsideRegionWarning
 from terrain.files.documents import parse_yaml, read_yaml
-from terrain.kinematics.wheels import no_slip_twist
+from terrain.kinematics.wheels import no_slip_twist, rolling_matrix
+from terrain.learned_term import MOTION, Factor, LearnedTerm, learned_lines, rolled_inputs, rolling_change
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import BicycleRobot, Range, Region, Robot, description_file, outside, robot_from, widened
 
@@ -73,7 +75,8 @@ def apply_homes(robot: AnyRobot, names: Collection[str] = tuple(PARAMETER)) -> A
 def corrected(robot: AnyRobot) -> AnyRobot:
     """Return the robot that filters take, together with a log that is :func:`corrected_log`.
 
-    Of effects without a home in the description those are left that have no inverse on samples.  A robot that was
+    Of effects without a home in the description those are left that have no inverse on samples.  Learned motion of
+    robots that skid or drive on omni wheels is in the wheels' samples; of others filters know none.  A robot that was
     corrected is returned as it is.
 
     Examples
@@ -83,6 +86,7 @@ def corrected(robot: AnyRobot) -> AnyRobot:
     >>> round(robot.wheel_radius_m, 3), dict(robot.effects)
     (0.21, {})
     """
+    robot = replace(robot, learned=()) if robot.learned else robot
     if not robot.effects:
         return robot
     return _without(apply_homes(robot), [name for name in robot.effects if PARAMETER[name].inverse])
@@ -104,6 +108,7 @@ def check_corrected(robot: Robot) -> None:
     terrain.errors.ConfigError: robot agrimaro: camera_yaw_rad is not corrected, neither in it nor in its log
     """
     left = set(robot.effects) - set(corrected(robot).effects)
+    left |= {f"learned {term.channel}" for term in robot.learned}
     if left:
         raise ConfigError(
             f"robot {robot.name}: {', '.join(sorted(left))} is not corrected, neither in it nor in its log"
@@ -272,16 +277,16 @@ def correct_live(robot: AnyRobot) -> tuple[AnyRobot, Correction | None]:
     >>> correct_live(load_robot("husky"))[1] is None
     True
     """
-    return corrected(robot), Correction(robot) if robot.effects else None
+    return corrected(robot), Correction(robot) if robot.effects or robot.learned else None
 
 
 def corrected_log(run: RunLog, robot: Robot) -> RunLog:
     """Return a log as the robot would have written it without the effects that have an inverse on samples.
 
     Commands, estimates and labels are left alone; of a simulated truth the wheels' rates become those of
-    wheels of one radius.  Without effects the log is returned as it is.
+    wheels of one radius.  Without effects and learned terms the log is returned as it is.
     """
-    if not robot.effects:
+    if not robot.effects and not robot.learned:
         return run
     wheels = run.streams.get("wheels")
     correction = Correction(robot, float(wheels.time_s[0]) if wheels is not None and len(wheels) else 0.0)
@@ -294,6 +299,9 @@ def corrected_log(run: RunLog, robot: Robot) -> RunLog:
 
 class Correction:
     """Takes a robot's effects off samples, a run in one block or block by block.
+
+    Learned motion of a robot that skids or drives on omni wheels is added to the wheels: filters, which take these to
+    roll, then move as the body does.
 
     Drifts count from the first stamp of the wheels, ``start_s``, by default from the first stamp that comes.
     """
@@ -310,6 +318,9 @@ class Correction:
         # what was added last comes off first: offsets, then factors
         self._acting = sorted(acting, key=lambda each: each[1].is_factor)
         self._memory: dict[str, Any] = {}
+        rolls = robot.skids or robot.on_omni_wheels
+        self._terms = [term for term in robot.learned if term.channel in MOTION] if rolls else []
+        self._lags: list[dict[Factor, Array]] = [{} for _ in self._terms]
 
     def __call__(
         self, name: str, channels: tuple[str, ...], time_s: Array, values: Array
@@ -323,9 +334,36 @@ class Correction:
         own = [(value, inverse) for value, inverse in self._acting if name in inverse.streams]
         if any(inverse.columns != STAMPS for _, inverse in own):
             values = np.array(values, dtype=float)
+        added = self._rolling(name, channels, time_s, values)
         about = np.asarray(time_s), values, self._start_s, self._robot, self._applied, self._memory
         with np.errstate(invalid="ignore", over="ignore"):  # samples may be no finite numbers
-            return changed_samples(Block(name, channels, *about), own, False)
+            stamps, values = changed_samples(Block(name, channels, *about), own, False)
+        return stamps, values if added is None else values + added
+
+    def _rolling(self, name: str, channels: tuple[str, ...], time_s: Array, values: Array) -> Array | None:
+        """Return what learned motion adds to the samples of wheels, which are still as measured; None without."""
+        robot, applied = self._robot, self._applied
+        if name != "wheels" or not self._terms or not set(robot.rate_channels) <= set(channels):
+            return None
+        places = [channels.index(channel) for channel in robot.rate_channels]
+        ratio = robot.motors.reduction_ratio if robot.by_motor else 1.0
+        speed = values[:, places] * (robot.wheel_radius_m / ratio if robot.by_motor else 1.0)
+        nothing = np.zeros(len(values))
+        inputs = rolled_inputs(robot, speed, np.zeros(speed.shape), nothing, nothing)
+        before = np.concatenate([[self._memory.get("learned", math.nan)], time_s])
+        if np.isfinite(time_s).any():
+            self._memory["learned"] = float(time_s[np.isfinite(time_s)][-1])
+        change = rolling_change(self._terms, inputs, np.diff(before), self._lags)
+        added = np.zeros(values.shape)
+        if robot.skids:
+            turn = 0.5 * applied.track_m * change[:, 2]
+            added[:, places] = np.column_stack([change[:, 0] - turn, change[:, 0] + turn])
+        else:
+            place = robot.wheel_positions_m, robot.wheel_directions_rad, robot.roller_angles_rad
+            added[:, places] = change @ rolling_matrix(*place).T
+        if robot.by_motor:
+            added *= ratio / applied.wheel_radius_m
+        return added
 
 
 class Origin(StrEnum):
@@ -402,10 +440,11 @@ def extended_yaml(
     intervals: Mapping[str, tuple[float, float]],
     source: str,
     region: Region | None = None,
+    learned: Sequence[LearnedTerm] = (),
 ) -> str:
-    """Return the description of a robot with a section ``effects``, as YAML.
+    """Return the description of a robot with a section ``effects``, and ``learned`` where there are terms, as YAML.
 
-    Everything else is kept, comments included; an earlier section ``effects`` is replaced.
+    Everything else is kept, comments included; earlier sections of these names are replaced.
 
     Parameters
     ----------
@@ -414,6 +453,7 @@ def extended_yaml(
     intervals : 95 % of each value
     source : of the numbers, in words
     region : of driving, that they were validated in
+    learned : terms that act beside the effects
 
     Raises
     ------
@@ -460,24 +500,31 @@ def extended_yaml(
         }
         lines.append("  region:")
         lines += [f"    {n}: {_flow(e)}" for n, e in {**ranges, "terrains": [*region.terrains]}.items()]
-    text = _without_effects(path.read_text(encoding="utf-8-sig")) + "\n".join(lines) + "\n"
+    lines += learned_lines(learned)
+    text = _without_extension(path.read_text(encoding="utf-8-sig")) + "\n".join(lines) + "\n"
     try:
         content = parse_yaml(text)
     except ValueError:
         content = None
-    others = {name: entry for name, entry in described.items() if name != "effects"}
-    if not isinstance(content, dict) or {n: e for n, e in content.items() if n != "effects"} != others:
+    own, kept = (
+        {n: e for n, e in each.items() if n not in EXTENSION} if isinstance(each, dict) else None
+        for each in (described, content)
+    )
+    if own != kept:
         raise ConfigError(f"{path}: cannot be extended as it is written: one section a line is required")
     robot_from(path.name, content)
     return text
 
 
-def _without_effects(text: str) -> str:
-    """Return the text of a description without its section ``effects``."""
+EXTENSION = ("effects", "learned")  #: Sections that an extension writes.
+
+
+def _without_extension(text: str) -> str:
+    """Return the text of a description without the sections that an extension writes."""
     lines, inside = [], False
     for line in text.splitlines():
         if line.strip() and not line.startswith((" ", "#")):
-            inside = line.startswith("effects:")
+            inside = line.startswith(tuple(f"{name}:" for name in EXTENSION))
         if not inside:
             lines.append(line)
     return "\n".join(lines).rstrip() + "\n"

@@ -13,8 +13,8 @@ Geometry and mass are required of every robot; the sections ``body``, ``motors``
 ``sensors`` by what simulates a robot or filters its log.  The section ``identified`` keeps what logs of one
 robot showed beside its nominal figures: its effective track, the radius that its wheels roll on, delays.  The
 list ``filters`` names the filters and observers that apply, where not all of its drive do.  The section
-``effects`` of an extended robot (:mod:`terrain.effects`) says what else acts; :mod:`terrain.extension` makes
-use of it.
+``effects`` of an extended robot (:mod:`terrain.effects`) says what else acts, and the section ``learned``
+(:mod:`terrain.learned_term`) what acts without a name; :mod:`terrain.extension` makes use of both.
 
 **The region of driving** that an extended robot was validated in is part of the section ``effects``; a range that was
 not measured is left out::
@@ -46,6 +46,7 @@ from terrain.effects import read_effects
 from terrain.errors import ConfigError
 from terrain.files.documents import check_keys, is_number, numbers, read_yaml
 from terrain.files.names import check_name, described_file, packaged, shown
+from terrain.learned_term import LearnedTerm, read_learned
 from terrain.records import Array, read_only
 
 #: Part of a range's width that a run may go beyond it: its ends are percentiles, which runs of the same kind
@@ -327,6 +328,8 @@ class Robot(ABC):
     identified: Mapping[str, float] = field(default_factory=dict, hash=False)
     #: filters and observers that its description lists; none where all of its drive apply
     filters: tuple[str, ...] = ()
+    #: what acts on it without a name, of :mod:`terrain.learned_term`
+    learned: tuple[LearnedTerm, ...] = field(default=(), hash=False)
 
     body: Body = field(init=False, repr=False, compare=False)  #: masses and tyres
     motors: Motors = field(init=False, repr=False, compare=False)  #: and their speed loop
@@ -903,7 +906,7 @@ def robot_from(file: str, described: Any) -> Robot:
     """Return the robot of a description's content; ``file`` is what messages call it."""
     drive = described.get("drive") if isinstance(described, dict) else None
     kind = KIND_OF_DRIVE.get(drive, SkidSteerRobot) if isinstance(drive, str) else SkidSteerRobot
-    optional = (*KIND_OF_SECTION, "identified", "filters", "effects")
+    optional = (*KIND_OF_SECTION, "identified", "filters", "effects", "learned")
     check_keys(file, described, ["name", "drive", *kind.numbers], optional=optional)
     name = described["name"]
     if not isinstance(name, str) or not name:
@@ -935,5 +938,7 @@ def robot_from(file: str, described: Any) -> Robot:
         stated = described["effects"].get("region")
         region = None if stated is None else read_region(f"{file}: effects: region", stated)
         robot = replace(robot, effects=effects, effects_cov=cov, region=region)
+    if "learned" in described:
+        robot = replace(robot, learned=read_learned(f"{file}: learned", described["learned"]))
     robot.check_geometry(file)
     return robot

@@ -70,7 +70,7 @@ def compare_runs(
         if not len(rows.time_s):
             continue
         if extended is not None:
-            after = rows_of(run, planar, extended.vector, (), low_pass).predicted
+            after = rows_of(run, extended.planar_on(run.terrain), extended.vector, (), low_pass).predicted
         inputs = dict(zip(INPUTS, rows.inputs.T, strict=False), time_s=rows.time_s)
         del inputs["wheel_phase_rad"]
         about = rows.run_id, rows.terrain, held_out, rows.time_s, rows.pace_mps

@@ -67,7 +67,8 @@ def simulation_for(
     The ``signals`` of the runs are taken where they are known already.
     """
     labels = sorted({run.terrains[0] if len(run.terrains) == 1 else "" for run in runs})
-    simulation = Simulation(robot, Ground(), robot.effects, spread_numbers("scatter"))
+    scatter = spread_numbers("scatter")
+    simulation = Simulation(robot, Ground(), robot.effects, scatter, learned=robot.learned)
     known = {*soil_names(), *packaged(EXTRA)}
     every = [signals_of(run, robot) for run in runs] if signals is None else signals
     grounds, soils = {}, set()

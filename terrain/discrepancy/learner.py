@@ -1,26 +1,53 @@
-"""What a learner without names reaches on runs held out: how much of the residual is there to be found.
+"""What a learner without names reaches on runs held out, and what of it goes into the extended robot.
 
-Measured minus simulated of each channel is regressed on the inputs of the simulation, their products,
-magnitudes and rates, a few rows before and after, by Bayesian linear regression, whose two variances are
-set by the data (MacKay, Bayesian interpolation, Neural Computation 1992; ``BayesianRidge`` of scikit-learn).
-It is fitted to the runs behind the diagnosis and judged on the others: what it removes there and the named
-causes do not, some cause without a name makes.
+**The black-box reference** states how much of the residual is there to be found.  Measured minus simulated of each
+channel is regressed on the inputs of the simulation, their products, magnitudes and rates, a few rows before and
+after, by Bayesian linear regression, whose two variances are set by the data (MacKay, Bayesian interpolation, Neural
+Computation 1992; ``BayesianRidge`` of scikit-learn).  It is fitted to the runs behind the diagnosis and judged on the
+others: what it removes there and the named causes do not, some cause without a name makes.
+
+**Learned terms** (:mod:`terrain.learned_term`) are learned channel by channel on what the named causes leave: products
+of a dictionary are selected one after the other, by what each takes off the square beside those before (orthogonal
+least squares: Chen, Billings and Luo, Int. J. Control 1989).  How many there are is decided by cross-validation over
+sessions, or runs where there are few: the fewest whose error is within one standard error of the least (Breiman et
+al., Classification and Regression Trees, 1984, 3.4.3), or as many as have the least where the fewest do not reach
+:data:`ENOUGH` of the black-box reference in the same folds.  None is the answer where none is within it.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import combinations_with_replacement
+from itertools import combinations, combinations_with_replacement
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import t as student
 
 from terrain.discrepancy.compared import ComparedRun
 from terrain.discrepancy.evidence import MIN_CLUSTERS
 from terrain.discrepancy.held_out import ratio_of_sums
-from terrain.discrepancy.runs import measured_channels
-from terrain.effects import CHANNELS
+from terrain.discrepancy.noise import Noise
+from terrain.discrepancy.runs import (
+    LowPass,
+    Signals,
+    Simulation,
+    measured_channels,
+    rows_of,
+    term_inputs,
+    term_rows,
+)
+from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
+from terrain.learned_term import (
+    INPUTS,
+    MOTION,
+    OF_WHEELS,
+    LearnedTerm,
+    columns_of,
+    factors_of,
+    inputs_used,
+    where_it_acts,
+)
 from terrain.records import Array
 
 DRIVEN = ("speed_mps", "turn_mps", "steer_rad", "grade_rad", "roll_rad", "sideways_mps")
@@ -123,3 +150,279 @@ def _regressors(run: ComparedRun) -> Array:
     moving = np.column_stack([*inputs[:3], inputs[-1], inputs[0] * inputs[1], *signed])
     late = [moving[np.clip(at - lag, 0, at.size - 1)] for lag in LAGS]
     return np.hstack([np.column_stack([*plain, *products, *signed, *rates]), *late])
+
+
+# -- Terms that are learned -------------------------------------------------------------------------------------
+
+ENOUGH = (
+    0.9  #: Part of the black-box reference's gain that few products have to reach, to be preferred to more.
+)
+MAX_PRODUCTS = 30  #: Products of a term; the black-box reference has some eighty.
+#: Groups of runs, or sessions, of the cross-validation; with fewer nothing is learned.
+MAX_GROUPS, MIN_GROUPS = 12, 3
+REFERENCE_FOLDS = 4  #: Folds of the black-box reference.
+
+#: Edges of a run's range: single samples, as of a wheel that spun, are not what it drove.
+PERCENTILES = (1.0, 99.0)
+#: Quantiles of an input's magnitude, where it moves, from which a product may begin.
+KNOTS = (0.25, 0.5, 0.75)
+LEAST_SPREAD = 0.02  #: Standard deviation of an input that can be learned on, in its own unit.
+LAGS_S = (0.1, 0.3, 1.0)  #: Lags over which changes of an input are taken.
+LEVEL = 0.95  #: Probability with which a term gains at all on groups left out.
+RIDGE = 1e-4  #: Over the square of each product, added to it: products of a dictionary are nearly dependent.
+COLLINEAR = 1e-4  #: Part of a product's square that has to be its own, beside those selected.
+
+ORDER = (HEADING, SPEED_X, SPEED_Y, GYRO, ACCEL, CURRENT, TURNING_CURRENT)
+"""Channels in the order in which they are learned: sensors see the motion, so that comes first."""
+
+
+class Learned(NamedTuple):
+    """What was learned of one channel."""
+
+    term: LearnedTerm | None  #: None where none is better than none
+    inner_gain: (
+        float  #: part of the square, before the causes, that causes and term remove in the inner folds
+    )
+    reference_gain: float  #: that the black-box reference removes there; NaN where there are too few runs
+    left_std: float  #: beside the noise, of what is left there, in the channel's unit
+
+
+def learn_terms(
+    simulation: Simulation,
+    signals: Sequence[Signals],
+    compared: Sequence[ComparedRun],
+    low_pass: LowPass,
+    noise: Noise,
+    source: str = "learned",
+    seed: int = 0,
+) -> dict[str, Learned]:
+    """Return by channel what was learned on runs; of channels that none of them measured nothing.
+
+    Parameters
+    ----------
+    simulation : with all named causes built in, and what was learned before
+    signals, compared : of the runs, faults repaired; and the same beside the simulation before the causes
+    source : of the terms, in words
+    seed : of the groups of the cross-validation, where runs are not of several sessions
+    """
+    by_id = {run.run_id: run for run in compared}
+    runs = [run for run in signals if run.run_id in by_id]
+    compared = [by_id[run.run_id] for run in runs]
+    groups = groups_of(runs, seed)
+    if groups.max(initial=-1) + 1 < MIN_GROUPS:
+        return {}
+    measured, learned = measured_channels(compared), {}
+    steps_inputs = [term_inputs(run, simulation, low_pass) for run in runs]
+    every = np.concatenate([inputs for _, inputs in steps_inputs])
+    ranges = driven_ranges([inputs for _, inputs in steps_inputs])
+    for channel in ORDER:
+        # without a heading of its own the gyro shows the motion
+        shown = GYRO if channel == HEADING and HEADING not in measured else channel
+        if shown not in measured or (channel == GYRO and HEADING not in measured):
+            continue
+        products = dictionary(every, channel)
+        grams = []
+        for run, (dt, inputs) in zip(runs, steps_inputs, strict=True):
+            columns = columns_of(products, inputs, np.full(len(inputs), dt))
+            rows = rows_of(run, simulation.planar_on(run.terrain), simulation.vector, (), low_pass)
+            left = rows.residual[:, [CHANNELS.index(shown)]]
+            table = np.hstack([term_rows(run, simulation, low_pass, shown, channel, columns), left])
+            table = table[np.isfinite(table).all(axis=1)]
+            grams.append((table.T @ table, len(table)))
+        sums = np.zeros((groups.max() + 1, len(products) + 1, len(products) + 1))
+        np.add.at(sums, groups, np.array([gram for gram, _ in grams]))
+        n_rows = sum([n for _, n in grams])
+        c = CHANNELS.index(shown)
+        before = sum(float(np.nansum(run.residual(False)[:, c] ** 2)) for run in compared)
+        if not n_rows or not before > 0.0:
+            continue
+        errors = cross_validated(sums)
+        reference = _reference_error(compared, groups, c)
+        n = _size(errors, (1.0 - ENOUGH) * before + ENOUGH * reference)
+        of_noise = np.concatenate([noise.size(run.pace_mps)[:, c] for run in compared]) ** 2
+        left_std = math.sqrt(max(float(errors[:, n].sum()) / n_rows - float(np.nanmean(of_noise)), 0.0))
+        term = None
+        if n:
+            total = sums.sum(axis=0)
+            chosen = selected(total, n)
+            coefficients, covariance = fitted(sums, chosen)
+            names = tuple(products[i] for i in chosen)
+            used = region_of_term(names, ranges)
+            term = LearnedTerm(channel, names, coefficients, covariance, used, left_std, "learned", source)
+            added = [term.predict(inputs, np.full(len(inputs), dt))[0] for dt, inputs in steps_inputs]
+            says = where_it_acts(channel, names, np.concatenate(added), every)
+            term = LearnedTerm(channel, names, coefficients, covariance, used, left_std, says, source)
+            simulation = simulation.with_learned([term])
+        inner_gain, reference_gain = (1.0 - np.array([errors[:, n].sum(), reference]) / before).tolist()
+        learned[channel] = Learned(term, inner_gain, reference_gain, left_std)
+    return learned
+
+
+def groups_of(runs: Sequence[Signals], seed: int) -> Array:
+    """Return the group (runs,) of each run in the cross-validation: its session, or one that is drawn."""
+    sessions = sorted({run.session for run in runs})
+    if len(sessions) >= MIN_GROUPS:
+        return np.array([sessions.index(run.session) for run in runs]) % MAX_GROUPS
+    return np.random.default_rng(seed).permutation(len(runs)) % MAX_GROUPS
+
+
+def dictionary(inputs: Array, channel: str) -> tuple[str, ...]:
+    """Return the products that a term of a channel may have, of inputs (n, len(INPUTS)) that were driven.
+
+    Simpler ones come first: of two that are as good the first is selected.
+    """
+    motion, shapes, singles = channel in MOTION, {}, ["moving"]
+    for name in OF_WHEELS if motion else INPUTS:
+        x = inputs[:, INPUTS.index(name)]
+        x = x[np.isfinite(x)]
+        if not x.size or x.std() < LEAST_SPREAD:
+            continue
+        shapes[name] = [name, f"abs({name})", f"sign({name})", f"max({name}, 0)", f"max(-{name}, 0)"]
+        size = np.abs(x[np.abs(x) > LEAST_SPREAD])
+        for knot in np.quantile(size, KNOTS):
+            shapes[name] += [f"max({name} - {knot:.2g}, 0)", f"max(-{name} - {knot:.2g}, 0)"]
+        singles += [*shapes[name], f"{name} * abs({name})"]
+        if name in OF_WHEELS:
+            singles += [f"change({name}, {lag_s:g})" for lag_s in LAGS_S]
+    pairs = []
+    for one, other in combinations(shapes, 2):
+        few = 5 if len(shapes) > 2 else None  # hinges in products of two inputs alone
+        pairs += [
+            f"{a} * {b}"
+            for i, a in enumerate(shapes[one])
+            for j, b in enumerate(shapes[other])
+            if (few is None and (i < 5 or j < 5)) or (i < 5 and j < 5)
+        ]
+    return tuple(dict.fromkeys([*([] if motion else ["1"]), *singles, *pairs]))
+
+
+def driven_ranges(runs: Sequence[Array]) -> dict[str, tuple[float, float]]:
+    """Return the range of each input that at least two of runs (n, len(INPUTS)) drove."""
+    edges = np.array([np.nanpercentile(inputs, PERCENTILES, axis=0) for inputs in runs])
+    low, high = np.sort(edges[:, 0], axis=0)[1], np.sort(edges[:, 1], axis=0)[-2]
+    high = np.maximum(high, low + LEAST_RANGE)
+    return {name: (float(low[i]), float(high[i])) for i, name in enumerate(INPUTS)}
+
+
+def region_of_term(
+    products: Sequence[str], ranges: Mapping[str, tuple[float, float]]
+) -> dict[str, tuple[float, float]]:
+    """Return the region of a term: the ranges of its inputs.
+
+    Where products hold for turns to either side alike, a turn to one side shows what one to the other does.
+
+    Examples
+    --------
+    >>> region_of_term(["speed_mps * abs(turn_radps)"], {"speed_mps": (0.0, 1.0), "turn_radps": (-0.2, 1.5)})
+    {'speed_mps': (0.0, 1.0), 'turn_radps': (-1.5, 1.5)}
+    """
+    region = {name: ranges[name] for name in inputs_used(products)}
+    factors = [factor for product in products for factor in factors_of(product)]
+    if "turn_radps" in region and not any(
+        each.kind == "max" and each.name == "turn_radps" for each in factors
+    ):
+        widest = max(map(abs, region["turn_radps"]))
+        region["turn_radps"] = (-widest, widest)
+    return region
+
+
+def selected(gram: Array, n: int) -> list[int]:
+    """Return the places of the products that are selected one after the other, ``n`` at the most.
+
+    Parameters
+    ----------
+    gram : (k + 1, k + 1) sums of products of the k products, and of the residual last
+
+    Examples
+    --------
+    >>> x = np.random.default_rng(0).standard_normal((50, 3))
+    >>> table = np.column_stack([x, 2.0 * x[:, 2] - x[:, 0]])
+    >>> selected(table.T @ table, 3)
+    [2, 0]
+    """
+    left, chosen = gram.copy(), []
+    own = gram.diagonal()[:-1]
+    for _ in range(min(n, len(own))):
+        size, shown = left.diagonal()[:-1], left[:-1, -1]
+        gains = np.where(size > COLLINEAR * own, shown**2 / np.maximum(size, 1e-300), 0.0)
+        best = int(np.argmax(gains))
+        if not gains[best] > 1e-12 * gram[-1, -1]:
+            break
+        chosen.append(best)
+        left -= np.outer(left[best], left[best]) / left[best, best]
+    return chosen
+
+
+def _coefficients(gram: Array, chosen: Sequence[int]) -> tuple[Array, Array]:
+    """Return coefficients (k,) of selected products, and the inverse (k, k) that they follow from."""
+    own = gram[np.ix_(chosen, chosen)]
+    inverse = np.linalg.inv(own + RIDGE * np.diag(own.diagonal()))
+    return inverse @ gram[list(chosen), -1], inverse
+
+
+def fitted(sums: Array, chosen: Sequence[int]) -> tuple[Array, Array]:
+    """Return coefficients (k,) of selected products, and their covariance (k, k) by how groups differ.
+
+    Residuals within a run are not independent, so that groups are what scatters (sandwich; Liang and Zeger,
+    Biometrika 1986), with the correction for few of them.
+
+    Parameters
+    ----------
+    sums : (groups, p + 1, p + 1) sums of products by group, of the residual last
+    """
+    total, n = sums.sum(axis=0), len(sums)
+    coefficients, inverse = _coefficients(total, chosen)
+    scores = sums[:, list(chosen), -1] - sums[:, list(chosen)][:, :, list(chosen)] @ coefficients
+    return coefficients, n / (n - 1) * inverse @ (scores.T @ scores) @ inverse
+
+
+def cross_validated(sums: Array) -> Array:
+    """Return the squared error (groups, sizes) of each group by products that are selected on the others."""
+    total, errors = sums.sum(axis=0), np.empty((len(sums), MAX_PRODUCTS + 1))
+    for g, own in enumerate(sums):
+        order = selected(total - own, MAX_PRODUCTS)
+        errors[g] = own[-1, -1]
+        for n in range(1, MAX_PRODUCTS + 1):
+            chosen = order[:n]
+            x = np.append(-_coefficients(total - own, chosen)[0], 1.0)
+            places = [*chosen, -1]
+            errors[g, n] = x @ own[np.ix_(places, places)] @ x
+    return errors
+
+
+def _size(errors: Array, enough: float) -> int:
+    """Return how many products a term has, by errors (groups, sizes) of the cross-validation."""
+    total, freedom = errors.sum(axis=0), len(errors) - 1
+    best = int(np.argmin(total))
+
+    def gains(n: int) -> tuple[Array, Array]:
+        """Return what each size has more than ``n`` and its standard error (sizes,), of ratios of sums over groups."""
+        apart = errors - errors[:, [n]]
+        ratio = apart.sum(axis=0) / total[0]
+        scatter = ((apart - ratio * errors[:, [0]]) ** 2).sum(axis=0) * (1.0 + 1.0 / freedom)
+        return ratio, np.sqrt(scatter) / total[0]
+
+    more, error = gains(best)
+    few = int(np.argmax(more <= error))
+    n = best if few and total[few] > enough else few
+    more, error = gains(n)
+    return n if more[0] > student.ppf(LEVEL, freedom) * error[0] else 0
+
+
+def _reference_error(compared: Sequence[ComparedRun], groups: Array, c: int) -> float:
+    """Return the squared error of the black-box reference of a channel, in folds of whole groups."""
+    from sklearn.linear_model import BayesianRidge
+
+    fold = np.repeat(groups % REFERENCE_FOLDS, [len(run.time_s) for run in compared])
+    x, y = (
+        np.concatenate([_regressors(run) for run in compared]),
+        np.concatenate([run.residual(False)[:, c] for run in compared]),
+    )
+    known, total = np.isfinite(y) & np.isfinite(x).all(axis=1), 0.0
+    spread = x[known].std(axis=0)
+    x = (x - x[known].mean(axis=0))[:, spread > LEAST_RANGE] / spread[spread > LEAST_RANGE]
+    for k in np.unique(fold[known]):
+        train, test = known & (fold != k), known & (fold == k)
+        predicted = BayesianRidge().fit(x[train], y[train]).predict(x[test])
+        total += float(((y[test] - predicted) ** 2).sum())
+    return total

@@ -41,10 +41,12 @@ from terrain.errors import ConfigError, DataError
 from terrain.kernels import njit
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
+from terrain.learned_term import FIELDS, LearnedTerm, rolled_inputs
 from terrain.logs.schema import POSE_CHANNELS
 from terrain.records import Array, RunLog
 from terrain.robots import BicycleRobot, Robot
 from terrain.simulation.plants.planar import (
+    TRUTH,
     Ground,
     Planar,
     corrected_inputs,
@@ -80,6 +82,7 @@ class Simulation:
     varied_scatter: Mapping[str, float] = field(default_factory=dict)
     #: how much the residual of a channel depends on an input by the simulation's own error
     probe_error: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    learned: tuple[LearnedTerm, ...] = ()  #: what is built in without a name
 
     @property
     def library(self) -> tuple[Effect, ...]:
@@ -88,7 +91,7 @@ class Simulation:
 
     def planar_on(self, terrain: str) -> Planar:
         """Return the numbers for the kernels on the terrain of a label, the default one for all others."""
-        return make_planar(self.robot, self.grounds.get(terrain, self.ground))
+        return make_planar(self.robot, self.grounds.get(terrain, self.ground))._replace(learned=self.learned)
 
     @property
     def known_scatter(self) -> dict[str, float]:
@@ -100,6 +103,10 @@ class Simulation:
     def vector(self) -> Array:
         """Parameters (len(PARAMETERS),) of the effects built in."""
         return vector_of(self.effects)
+
+    def with_learned(self, terms: Sequence[LearnedTerm]) -> Simulation:
+        """Return the same with learned terms added to those that are built in already."""
+        return replace(self, learned=(*self.learned, *terms))
 
     def with_effects(self, values: Mapping[str, float]) -> Simulation:
         """Return the same with effects added to those that are built in already."""
@@ -504,14 +511,7 @@ def rows_of(
     frequency, the commands do not.
     """
     dt, wheel_speed, steer, grade, roll, measured = prepare_inputs(signals, low_pass)
-    n_rows = max((len(wheel_speed) - low_pass.taps.size) // low_pass.every + 1, 0)
-    first = slice(0, math.ceil(STEADY_S / dt) + 1)
-    change_mps, change_rad = (np.ptp(values[first], axis=0).max() for values in (wheel_speed, steer))
-    steady = change_mps <= STEADY_MPS and change_rad <= STEADY_RAD
-    skip = math.ceil(SETTLE_S * low_pass.rate_hz)
-    start = 0 if len(wheel_speed) * dt < SHORT_S and steady else skip
-    kept = slice(start, max(n_rows - skip, start))
-
+    n_rows, kept = _kept_rows(dt, wheel_speed, steer, low_pass)
     known = np.isfinite(measured)
     holes = known[:, :0] if known[:, known.any(axis=0)].all() else known
     window = low_pass.taps, low_pass.every
@@ -550,6 +550,46 @@ def rows_of(
     shown = decimate(np.ascontiguousarray(measured), holes, *window)[kept]
     driven = np.column_stack([decimate(driven, known[:, :0], *window)[kept], phase[at]])
     return Rows(signals.run_id, signals.terrain, at * dt, shown, now, change, driven)
+
+
+def _kept_rows(dt: float, wheel_speed: Array, steer: Array, low_pass: LowPass) -> tuple[int, slice]:
+    """Return the number of rows of a run, and those that are kept of them."""
+    n_rows = max((len(wheel_speed) - low_pass.taps.size) // low_pass.every + 1, 0)
+    first = slice(0, math.ceil(STEADY_S / dt) + 1)
+    change_mps, change_rad = (np.ptp(values[first], axis=0).max() for values in (wheel_speed, steer))
+    steady = change_mps <= STEADY_MPS and change_rad <= STEADY_RAD
+    skip = math.ceil(SETTLE_S * low_pass.rate_hz)
+    start = 0 if len(wheel_speed) * dt < SHORT_S and steady else skip
+    return n_rows, slice(start, max(n_rows - skip, start))
+
+
+def term_inputs(signals: Signals, simulation: Simulation, low_pass: LowPass) -> tuple[float, Array]:
+    """Return the period of the replay's clock, and the inputs of learned terms (n, len(INPUTS)) on it."""
+    planar, vector = simulation.planar_on(signals.terrain), simulation.vector
+    dt, wheel_speed, steer, grade, roll, _ = prepare_inputs(signals, low_pass)
+    wheel_speed, grade, roll = corrected_inputs(planar.body, vector, dt, wheel_speed, grade, roll)
+    return dt, rolled_inputs(simulation.robot, wheel_speed, steer, grade, roll)
+
+
+def term_rows(
+    signals: Signals, simulation: Simulation, low_pass: LowPass, channel: str, acts_on: str, columns: Array
+) -> Array:
+    """Return what a channel shows of columns (n, k) on the replay's clock, as rows (m, k) beside those of a run.
+
+    ``acts_on`` is the channel of the learned term that the columns are of: motion shows as sensors see it.
+    """
+    planar, vector, c = simulation.planar_on(signals.terrain), simulation.vector, CHANNELS.index(channel)
+    dt, wheel_speed, steer, _, _, measured = prepare_inputs(signals, low_pass)
+    truth: Any = np.zeros(len(columns), TRUTH)
+    at_rest = sense(planar.body, vector, dt, truth)[:, c]
+    field_name, seen = FIELDS.get(acts_on, acts_on), np.empty_like(columns)
+    for j, column in enumerate(columns.T):
+        truth[field_name] = column
+        seen[:, j] = sense(planar.body, vector, dt, truth)[:, c] - at_rest
+    known = np.isfinite(measured[:, [c]])
+    holes = known[:, :0] if known.all() else np.repeat(known, columns.shape[1], axis=1)
+    rows = decimate(seen, holes, low_pass.taps, low_pass.every)
+    return np.asarray(rows[_kept_rows(dt, wheel_speed, steer, low_pass)[1]])
 
 
 def _rolled(planar: Planar, wheel_speed: Array, steer: Array) -> tuple[Array, Array, Array]:

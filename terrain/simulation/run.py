@@ -237,7 +237,12 @@ def simulate_run(
     effects = effects or {}
     if planar:
         ground, options = soils[terrain], {}
-        if not isinstance(robot, TrackedRobot) or ground.law != "janosi" or {**robot.effects, **effects}:
+        if (
+            not isinstance(robot, TrackedRobot)
+            or ground.law != "janosi"
+            or {**robot.effects, **effects}
+            or robot.learned
+        ):
             from terrain.simulation.plants.planar import planar_ground, spread_numbers
 
             if gnss is not None:

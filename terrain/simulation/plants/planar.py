@@ -139,6 +139,7 @@ from terrain.kernels import filled, inner, njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.commands import wheel_motion
 from terrain.kinematics.wheels import point_velocity, rolling_matrix, velocity_matrix, wheel_frame_velocities
+from terrain.learned_term import LearnedTerm, add_terms, rolled_inputs
 from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS, TWIST
 from terrain.records import Array, Label, Stream
 from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot
@@ -175,12 +176,13 @@ def shear_softness(force_ratio: float, grip_ratio: float) -> float:
 
 TRUTH = record(
     numbers(
-        "speed_x_mps speed_y_mps yaw_rate_radps accel_x_mps2 force_n current_a turning_current_a slip_ratio"
+        "speed_x_mps speed_y_mps yaw_rate_radps accel_x_mps2 force_n current_a turning_current_a slip_ratio "
+        "gyro_error_radps"
     )
 )
 """What the body does, before any sensor: speeds of the body's origin, specific force along x, traction, currents of
-motors as described, and slip; traction and slip are those along x, of an omni robot the slip of the body along what
-its wheels roll, and the sum of its currents' magnitudes."""
+motors as described, slip, and what a gyro reads too much; traction and slip are those along x, of an omni robot the
+slip of the body along what its wheels roll, and the sum of its currents' magnitudes."""
 
 N_SLIPS = 101
 _SLIPS = np.linspace(0.0, 1.0, N_SLIPS)
@@ -1003,6 +1005,7 @@ class Planar(NamedTuple):
     robot: Robot
     drive: PlanarDrive
     params: Array
+    learned: tuple[LearnedTerm, ...] = ()  # added to the motion, and to what is read of it
 
     @property
     def body(self) -> Array:
@@ -1040,7 +1043,8 @@ def make_planar(robot: Robot, ground: Ground) -> Planar:
         "seen_from_above": robot.on_omni_wheels,
     }
     drive, of_body = DRIVES[robot.drive], filled(PLANAR_BODY, **described)
-    return Planar(robot, drive, filled(drive.record, body=of_body, **drive.numbers(robot, ground)))
+    params = filled(drive.record, body=of_body, **drive.numbers(robot, ground))
+    return Planar(robot, drive, params, robot.learned)
 
 
 def move(
@@ -1067,7 +1071,13 @@ def move(
     """
     inputs = wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance
     truth = planar.drive.move(planar.params, vector, dt, inputs)
+    if not planar.learned:
+        _finish(planar.body, vector, dt, inputs, planar.drive.drifts, truth)
+        return truth
+    rolled = rolled_inputs(planar.robot, wheel_speed_mps, steer_rad, grade_rad, roll_rad)
+    add_terms(planar.learned, rolled, dt, truth, motion=True)
     _finish(planar.body, vector, dt, inputs, planar.drive.drifts, truth)
+    add_terms(planar.learned, rolled, dt, truth, motion=False)
     return truth
 
 
@@ -1151,7 +1161,7 @@ def sense(params: Array, vector: Array, dt: float, truth: Array) -> Array:
         row = truth[k]
         w = row.yaw_rate_radps
         v_x, v_y = point_velocity(row.speed_x_mps, row.speed_y_mps, w, lever_x, lever_y)
-        out[k, 0] = (1.0 + p.gyro_scale_ratio) * w + p.gyro_bias_radps
+        out[k, 0] = (1.0 + p.gyro_scale_ratio) * w + p.gyro_bias_radps + row.gyro_error_radps
         out[k, 1] = cos * v_x - sin * v_y
         out[k, 2] = sin * v_x + cos * v_y
         out[k, 3] = row.accel_x_mps2 + p.accel_bias_mps2
