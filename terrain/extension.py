@@ -38,8 +38,8 @@ from terrain.effects import (
 )
 from terrain.errors import ConfigError, OutsideRegionWarning
 from terrain.files.documents import parse_yaml, read_yaml
-from terrain.kinematics.wheels import no_slip_twist, rolling_matrix
-from terrain.learned_term import MOTION, Factor, LearnedTerm, learned_lines, rolled_inputs, rolling_change
+from terrain.kinematics.wheels import no_slip_twist, rolled_twist, rolling_matrix
+from terrain.learned_term import INPUTS, MOTION, Factor, LearnedTerm, learned_lines, rolling_change
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import BicycleRobot, Range, Region, Robot, description_file, outside, robot_from, widened
 
@@ -348,8 +348,8 @@ class Correction:
         places = [channels.index(channel) for channel in robot.rate_channels]
         ratio = robot.motors.reduction_ratio if robot.by_motor else 1.0
         speed = values[:, places] * (robot.wheel_radius_m / ratio if robot.by_motor else 1.0)
-        nothing = np.zeros(len(values))
-        inputs = rolled_inputs(robot, speed, np.zeros(speed.shape), nothing, nothing)
+        inputs = np.zeros((len(values), len(INPUTS)))
+        inputs[:, :3] = rolled_twist(robot, speed, np.zeros(speed.shape))
         before = np.concatenate([[self._memory.get("learned", math.nan)], time_s])
         if np.isfinite(time_s).any():
             self._memory["learned"] = float(time_s[np.isfinite(time_s)][-1])

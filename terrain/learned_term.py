@@ -58,7 +58,6 @@ from terrain.errors import ConfigError
 from terrain.files.documents import check_keys, is_number
 from terrain.files.names import shown
 from terrain.kernels import njit
-from terrain.kinematics.wheels import no_slip_twist, rolling_matrix
 from terrain.records import Array, read_only
 
 INPUTS = ("speed_mps", "sideways_mps", "turn_radps", "grade_rad", "roll_rad")
@@ -144,38 +143,6 @@ def inputs_used(products: Sequence[str]) -> tuple[str, ...]:
 
 def _inputs_of(factor: Factor) -> tuple[str, ...]:
     return OF_WHEELS[::2] if factor.kind == "moving" else (factor.name,) if factor.name else ()
-
-
-def rolled_inputs(
-    robot: Any, wheel_speed_mps: Array, steer_rad: Array, grade_rad: Array, roll_rad: Array
-) -> Array:
-    """Return the inputs (n, len(INPUTS)) by the wheels of a robot.
-
-    Parameters
-    ----------
-    robot : :class:`terrain.robots.Robot`
-    wheel_speed_mps : (n, wheels) circumferential; of a car-like robot the last is the rear axle's
-    steer_rad : (n, wheels); not looked at without steering
-    grade_rad, roll_rad : (n,)
-    """
-    out = np.zeros((len(wheel_speed_mps), len(INPUTS)))
-    out[:, 3], out[:, 4] = grade_rad, roll_rad
-    if robot.skids:
-        left, right = wheel_speed_mps[:, 0], wheel_speed_mps[:, -1]
-        out[:, 0], out[:, 2] = 0.5 * (left + right), (right - left) / robot.track_m
-    elif robot.on_omni_wheels:
-        rolling = rolling_matrix(robot.wheel_positions_m, robot.wheel_directions_rad, robot.roller_angles_rad)
-        out[:, :3] = wheel_speed_mps @ np.linalg.pinv(rolling).T
-    elif robot.sideways:
-        twist, _ = no_slip_twist(
-            robot.wheel_positions_m, steer_rad + robot.wheel_directions_rad, wheel_speed_mps
-        )
-        out[:, :3] = twist
-    else:
-        along = np.cos(steer_rad[:, 0]) if robot.front_driven else 1.0
-        out[:, 0] = wheel_speed_mps[:, -1] * along
-        out[:, 2] = out[:, 0] * np.tan(steer_rad[:, 0]) / robot.wheelbase_m
-    return out
 
 
 @njit

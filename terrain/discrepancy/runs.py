@@ -41,7 +41,8 @@ from terrain.errors import ConfigError, DataError
 from terrain.kernels import njit
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
-from terrain.learned_term import FIELDS, LearnedTerm, rolled_inputs
+from terrain.kinematics.wheels import rolled_twist
+from terrain.learned_term import FIELDS, LearnedTerm
 from terrain.logs.schema import POSE_CHANNELS
 from terrain.records import Array, RunLog
 from terrain.robots import BicycleRobot, Robot
@@ -568,7 +569,7 @@ def term_inputs(signals: Signals, simulation: Simulation, low_pass: LowPass) -> 
     planar, vector = simulation.planar_on(signals.terrain), simulation.vector
     dt, wheel_speed, steer, grade, roll, _ = prepare_inputs(signals, low_pass)
     wheel_speed, grade, roll = corrected_inputs(planar.body, vector, dt, wheel_speed, grade, roll)
-    return dt, rolled_inputs(simulation.robot, wheel_speed, steer, grade, roll)
+    return dt, np.column_stack([rolled_twist(simulation.robot, wheel_speed, steer), grade, roll])
 
 
 def term_rows(

@@ -176,3 +176,36 @@ def no_slip_twist(
     square, seen = np.swapaxes(rows, -2, -1) @ rows, np.einsum("...ij,...i->...j", rows, speed)
     twist = np.linalg.solve(square, seen[..., None])[..., 0]
     return twist, np.linalg.norm(speed - np.einsum("...ij,...j->...i", rows, twist), axis=-1)
+
+
+def rolled_twist(robot: Any, wheel_speed_mps: Array, steer_rad: Array) -> Array:
+    """Return the twist (n, 3) that the wheels of a robot of any drive would roll without slip, as it is described.
+
+    Parameters
+    ----------
+    robot : :class:`terrain.robots.Robot`
+    wheel_speed_mps : (n, wheels) circumferential, of a car-like robot (n, 1) of the driven axle, too
+    steer_rad : (n, wheels) zeros taken off; not looked at without steering
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> rolled_twist(load_robot("husky"), np.array([[0.4, 0.6]]), np.zeros((1, 2))).round(3)
+    array([[0.5 , 0.  , 0.35]])
+    """
+    if robot.on_omni_wheels:
+        place = robot.wheel_positions_m, robot.wheel_directions_rad, robot.roller_angles_rad
+        return np.asarray(wheel_speed_mps @ np.linalg.pinv(rolling_matrix(*place)).T)
+    if robot.sideways:
+        return no_slip_twist(
+            robot.wheel_positions_m, steer_rad + robot.wheel_directions_rad, wheel_speed_mps
+        )[0]
+    out = np.zeros((len(wheel_speed_mps), 3))
+    if robot.skids:
+        left, right = wheel_speed_mps[:, 0], wheel_speed_mps[:, -1]
+        out[:, 0], out[:, 2] = 0.5 * (left + right), (right - left) / robot.track_m
+        return out
+    angle = steer_rad[:, 0]
+    out[:, 0] = wheel_speed_mps[:, 0] * np.cos(angle) if robot.front_driven else wheel_speed_mps[:, -1]
+    out[:, 2] = out[:, 0] * np.tan(angle) / robot.wheelbase_m
+    return out

@@ -138,8 +138,14 @@ from terrain.files.names import data_folder
 from terrain.kernels import filled, inner, njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.commands import wheel_motion
-from terrain.kinematics.wheels import point_velocity, rolling_matrix, velocity_matrix, wheel_frame_velocities
-from terrain.learned_term import LearnedTerm, add_terms, rolled_inputs
+from terrain.kinematics.wheels import (
+    point_velocity,
+    rolled_twist,
+    rolling_matrix,
+    velocity_matrix,
+    wheel_frame_velocities,
+)
+from terrain.learned_term import LearnedTerm, add_terms
 from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS, TWIST
 from terrain.records import Array, Label, Stream
 from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot
@@ -1074,7 +1080,7 @@ def move(
     if not planar.learned:
         _finish(planar.body, vector, dt, inputs, planar.drive.drifts, truth)
         return truth
-    rolled = rolled_inputs(planar.robot, wheel_speed_mps, steer_rad, grade_rad, roll_rad)
+    rolled = np.column_stack([rolled_twist(planar.robot, wheel_speed_mps, steer_rad), grade_rad, roll_rad])
     add_terms(planar.learned, rolled, dt, truth, motion=True)
     _finish(planar.body, vector, dt, inputs, planar.drive.drifts, truth)
     add_terms(planar.learned, rolled, dt, truth, motion=False)
