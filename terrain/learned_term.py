@@ -279,7 +279,10 @@ class LearnedTerm:
         """
         columns = self.columns(inputs, dt_s, memory)
         variance = np.einsum("nk,kl,nl->n", columns, self.covariance, columns)
-        return columns @ self.coefficients, np.sqrt(np.maximum(variance, 0.0))
+        added = np.zeros(len(inputs))
+        for column, value in zip(columns.T, self.coefficients.tolist(), strict=True):
+            added += value * column  # in one order, so that blocks of any length give the same bytes
+        return added, np.sqrt(np.maximum(variance, 0.0))
 
 
 def add_terms(terms: Sequence[LearnedTerm], inputs: Array, dt: float, truth: Array, motion: bool) -> None:
