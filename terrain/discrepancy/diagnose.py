@@ -8,6 +8,7 @@ probes of the remaining residual.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import combinations
@@ -310,7 +311,9 @@ NEAR_BOUND = 0.02
 """A value closer to a bound than that ratio of the range, or of twice the bound where the other is further
 from 0, is no value: the search would have gone on."""
 
-WORSE_RATIO = 1.1  #: A cause is withdrawn that makes the square of a channel larger by more than that
+WORSE_RATIO = 1.1
+"""A cause is withdrawn that makes the square of a channel larger by more than that, if what it changes there itself
+can make half of the rise: the rest is of the causes that were fitted with it."""
 
 PROBE_RATIO, PROBE_ALIKE = 0.5, 0.3
 """A cause is withdrawn if an input of its channel gains that ratio of its own gain beside it, and looks like
@@ -384,8 +387,12 @@ def reasons_to_withdraw(
             effects = channel_effects(fit, cause)
             if not effects[main[0]][2] > 0:
                 reason = f"it gains nothing in {main[0]}, its main channel, on runs left out"
+            weights = np.zeros((1, len(fit.info.names)))
+            weights[0, _own_and_base(fit, cause)[0]] = fit.change[at]
+            acts = dict(zip(CHANNELS, fit.info.channel_power(weights).tolist(), strict=True))
             for name, (without, with_cause, _) in reversed(effects.items()):
-                if with_cause > WORSE_RATIO * without:
+                most = acts[name] + 2.0 * math.sqrt(acts[name] * without)
+                if with_cause > WORSE_RATIO * without and most > 0.5 * (with_cause - without):
                     reason = f"it makes {name} worse, by {with_cause / without - 1.0:.0%} of the square"
         size, var = fit.change[at], np.maximum(np.diag(slow_cov - fit.cov)[at], 0.0)
         least = SLOW_Z * np.sqrt(var * fit.tests[cause.name].inflation), SLOW_RATIO * np.linalg.norm(size)
