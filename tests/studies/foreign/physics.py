@@ -79,6 +79,11 @@ class Motion(NamedTuple):
     slope_y: Array
     pull_n: Array  #: of each wheel along its plane
     load_n: Array
+    seen_x_mps: Array | None = (
+        None  #: speeds of a lidar in its axes, and its place east and north, where it is
+    )
+    seen_y_mps: Array | None = None  #: part of the motion
+    seen_m: Array | None = None
 
 
 def brush(z: Array) -> Array:

@@ -106,16 +106,15 @@ def lidar_of(motion: Motion, sensing: Sensing, rng: np.random.Generator) -> list
     v_x = motion.speed_x_mps - l_y * motion.yaw_rate_radps
     v_y = motion.speed_y_mps + l_x * motion.yaw_rate_radps
     cos, sin = math.cos(sensing.lidar_yaw_rad), math.sin(sensing.lidar_yaw_rad)
+    ahead, left = v_x * cos + v_y * sin, v_y * cos - v_x * sin
+    if motion.seen_x_mps is not None and motion.seen_y_mps is not None:
+        ahead, left = motion.seen_x_mps, motion.seen_y_mps
     late_s = sensing.lidar_late_s + sensing.lidar_late_s2pm * np.hypot(v_x, v_y)
     width = round(SCAN_S / SAMPLE_S)
     window = np.ones(width) / width
     every = round(1.0 / (LIDAR_HZ * SAMPLE_S))
     columns = []
-    for values, size in (
-        (v_x * cos + v_y * sin, 0.006),
-        (v_y * cos - v_x * sin, 0.006),
-        (motion.yaw_rate_radps, 0.008),
-    ):
+    for values, size in ((ahead, 0.006), (left, 0.006), (motion.yaw_rate_radps, 0.008)):
         scan = lfilter(window, [1.0], values, axis=0)
         seen = delayed(scan, late_s)[::every]
         columns.append(seen + coloured(rng, size, 0.05, seen.shape, 1.0 / LIDAR_HZ))
@@ -138,6 +137,8 @@ def pose_of(motion: Motion, sensing: Sensing, rng: np.random.Generator) -> list[
     l_x, l_y = sensing.lidar_m
     x = np.cumsum(east, axis=0) * SAMPLE_S + l_x * cos - l_y * sin
     y = np.cumsum(north, axis=0) * SAMPLE_S + l_x * sin + l_y * cos
+    if motion.seen_m is not None:
+        x, y = motion.seen_m[..., 0], motion.seen_m[..., 1]
     every = 3
     late_s = sensing.lidar_late_s + sensing.lidar_late_s2pm * np.hypot(east, north)
     seen = [delayed(each, late_s)[::every] for each in (x, y, motion.yaw_rad + sensing.lidar_yaw_rad)]
@@ -168,12 +169,16 @@ def counted(angle_rad: Array, sensing: Sensing) -> Array:
     return np.asarray(rate)
 
 
-def currents_of(pull_n: Array, load_n: Array, rate: Array, radius_m: Array, motor: Motor) -> Array:
-    """Return currents (n, runs, wheels) of motors that warm: torque over a constant that falls."""
+def torque_of(pull_n: Array, rate: Array, radius_m: Array, motor: Motor) -> Array:
+    """Return what motors (n, runs, wheels) give: for the pull of their wheels, friction and inertia."""
     turning = np.tanh(rate / 0.15)
     friction = motor.friction_nm * (1.0 + motor.crawl_ratio * np.exp(-((rate / 0.8) ** 2)))
     spin = motor.inertia_kgm2 * np.gradient(rate, SAMPLE_S, axis=0)
-    torque = radius_m * pull_n + friction * turning + spin
-    current = torque / motor.nm_per_a
+    return np.asarray(radius_m * pull_n + friction * turning + spin)
+
+
+def currents_of(torque_nm: Array, motor: Motor) -> Array:
+    """Return currents (n, runs, wheels) of motors that warm: torque over a constant that falls."""
+    current = torque_nm / motor.nm_per_a
     warmth = np.cumsum(current**2, axis=0) * SAMPLE_S * motor.heats_kps_a2
     return np.asarray(current / ((1.0 - motor.weak_ratio) * (1.0 - MAGNET_PK * warmth)))

@@ -2,16 +2,18 @@
 
 import doctest
 import math
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 
-from studies.foreign import physics, scoring, sensors, trial, worlds
+from studies.foreign import physics, scenes, scoring, sensors, trial, worlds
 from studies.foreign.physics import EVERY, G_MPS2, SAMPLE_S, Body, Motion, integrate
+from studies.foreign.scenes import Scene
 from studies.foreign.sensors import Motor, Sensing
 from studies.foreign.trial import Answer, Outcome, cases_of, outcome_of
 from studies.foreign.worlds import WORLDS, Driven, driven_by, effects_of, runs_of
-from terrain.effects import library_of
+from terrain.effects import LIBRARY, library_of
 from terrain.robots import load_robot
 
 SKID = WORLDS["plain", "skid"]().body
@@ -119,15 +121,16 @@ def test_sensors_measure_what_moves():
 def test_a_motor_draws_torque_over_its_constant_and_weakens_as_it_warms():
     pull, rate = np.full((6000, 1, 1), 50.0), np.full((6000, 1, 1), 4.0)
     motor = Motor(nm_per_a=2.0, friction_nm=1.0, inertia_kgm2=0.1)
-    current = sensors.currents_of(pull, pull, rate, np.array([0.2]), motor)[:, 0, 0]
+    torque = sensors.torque_of(pull, rate, np.array([0.2]), motor)
+    current = sensors.currents_of(torque, motor)[:, 0, 0]
     np.testing.assert_allclose(current[0], (50.0 * 0.2 + 1.0) / 2.0, rtol=1e-6)
     assert 1.0 < current[-1] / current[0] < 1.05
-    weak = sensors.currents_of(pull, pull, rate, np.array([0.2]), motor._replace(weak_ratio=0.2))
+    weak = sensors.currents_of(torque, motor._replace(weak_ratio=0.2))
     np.testing.assert_allclose(weak[0, 0, 0], current[0] / 0.8, rtol=1e-9)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", WORLDS, ids="_".join)
+@pytest.mark.parametrize("place", [p for p in WORLDS if p[0] == "plain" or find_spec("mujoco")], ids="_".join)
 def test_every_effect_shows_in_the_logs_of_its_world(place):
     world = WORLDS[place]()
     driven = driven_by(world, 2, np.random.default_rng(3), 4.0)
@@ -149,10 +152,12 @@ def test_names_of_answers_are_those_of_the_catalogue_or_of_what_it_lacks():
         drive = load_robot(WORLDS[place]().robot).drive
         names = {each.name for each in library_of(drive)}
         inside = [bool({*effect.right} & names) for effect in effects_of(*place)]
-        assert sum(inside) >= 4
-        assert len(inside) - sum(inside) >= 4
-    every = {effect.name for place in WORLDS for effect in effects_of(*place)}
-    assert len(every) >= 20
+        assert sum(inside) >= 5
+    plain = {effect.name: {*effect.right} for place in WORLDS for effect in effects_of("plain", place[1])}
+    catalogue = {effect.name for effect in LIBRARY}
+    inside = [bool(right & catalogue) for right in plain.values()]
+    assert sum(inside) >= 10
+    assert len(inside) - sum(inside) >= 9
 
 
 @pytest.mark.parametrize(
@@ -188,3 +193,25 @@ def test_driven_wheels_begin_and_end_at_rest():
     for place in WORLDS:
         driven: Driven = driven_by(WORLDS[place](), 1, np.random.default_rng(0), 3.0)
         assert not driven.rate[0].any()
+
+
+@pytest.mark.skipif(find_spec("mujoco") is None, reason="mujoco is not installed (pip install mujoco)")
+@pytest.mark.parametrize("kind", ["skid", "car", "omni"])
+def test_a_scene_drives_as_its_wheels_turn(kind):
+    world = WORLDS["mujoco", kind]()
+    driven = driven_by(world, 1, np.random.default_rng(0), 2.5)
+    level = driven._replace(slope=np.zeros((1, 2)))
+    recorded = scenes.moved(kind, world.body, Scene(), world.motor.inertia_kgm2, level)
+    rate = np.gradient(recorded.turned_rad[:, 0], SAMPLE_S, axis=0) * world.body.radius_m[0]
+    turns = np.full((1, rate.shape[1]), 1.0 / rate.shape[1])
+    if kind == "omni":
+        x, y = world.body.wheels_m.T
+        plane = np.arctan2(y, x) + np.pi / 2
+        turns = np.linalg.pinv(np.column_stack([np.cos(plane), np.sin(plane), np.hypot(x, y)]))
+    motion = recorded.motion
+    np.testing.assert_allclose(
+        motion.speed_x_mps[:, 0], (rate @ turns.T)[:, 0], atol=0.12 if kind == "skid" else 0.02
+    )
+    assert np.abs(motion.speed_x_mps).max() > 0.1
+    heavier = scenes.moved(kind, world.body._replace(mass_kg=2 * world.body.mass_kg), Scene(), 0.01, level)
+    assert not np.array_equal(heavier.motion.speed_x_mps, motion.speed_x_mps)

@@ -8,21 +8,23 @@ stands beside each effect.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.signal import lfilter
 
-from studies.foreign import sensors
+from studies.foreign import scenes, sensors
 from studies.foreign.physics import EVERY, SAMPLE_S, STEP_S, Body, integrate
+from studies.foreign.scenes import Recorded, Scene
 from studies.foreign.sensors import Motor, Sensing
 from terrain.records import Array, Label, RunLog, Stream
 from terrain.robots import Robot, load_robot
 
 RUN_S = 15.0  #: length of a run; its wheels are at rest at both ends
 SLOPE_STD, FRICTION_STD = 0.04, 0.03  #: from run to run
-NORMAL_LAG_S = 0.06  #: of each of the two lags by which wheels and steering follow commands
+LAG_S = 0.06  #: of each of the two lags by which wheels and steering follow commands
 
 
 class Linkage(NamedTuple):
@@ -44,6 +46,7 @@ class World(NamedTuple):
     motor: Motor
     sensing: Sensing
     linkage: Linkage = Linkage()
+    scene: Scene | None = None  #: of MuJoCo; None for the plain simulator
 
 
 def _skid() -> World:
@@ -105,11 +108,18 @@ def _omni() -> World:
     return World("omni", "robotino", body, motor, Sensing())
 
 
+def _scene(make: Callable[[], World]) -> Callable[[], World]:
+    return lambda: make()._replace(scene=Scene())
+
+
 WORLDS: dict[tuple[str, str], Callable[[], World]] = {
     ("plain", "skid"): _skid,
     ("plain", "car"): _car,
     ("plain", "swerve"): _swerve,
     ("plain", "omni"): _omni,
+    ("mujoco", "skid"): _scene(_skid),
+    ("mujoco", "car"): _scene(_car),
+    ("mujoco", "omni"): _scene(_omni),
 }
 """By engine and name."""
 
@@ -144,7 +154,7 @@ def _profiles(
         for k in range(1, n):
             value = value + np.clip(goal[k] - value, -pace * SAMPLE_S, pace * SAMPLE_S)
             out[k, i] = value
-    keep = math.exp(-SAMPLE_S / NORMAL_LAG_S)
+    keep = math.exp(-SAMPLE_S / LAG_S)
     for _ in range(2):
         out = np.asarray(lfilter([1.0 - keep], [1.0, -keep], out, axis=0))
     return out
@@ -219,21 +229,22 @@ def _omni_wheels(world: World, rng: np.random.Generator, runs: int, run_s: float
     v_x, v_y, w = np.moveaxis(_profiles(rng, runs, run_s, draw, np.array([0.6, 0.6, 2.0])), -1, 0)
     x, y = world.body.wheels_m.T
     plane = np.arctan2(y, x) + np.pi / 2
-    circumferential_mps = (
+    speed_mps = (
         v_x[..., None] * np.cos(plane) + v_y[..., None] * np.sin(plane) + w[..., None] * np.hypot(x, y)
     )
-    return circumferential_mps, np.broadcast_to(plane, circumferential_mps.shape)
+    return speed_mps, np.broadcast_to(plane, speed_mps.shape)
 
 
+STEERED = {"car": 2, "swerve": 3}  #: wheels that are steered, the first ones
 _WHEELS = {"skid": _skid_wheels, "car": _car_wheels, "swerve": _swerve_wheels, "omni": _omni_wheels}
 
 
 def driven_by(world: World, runs: int, rng: np.random.Generator, run_s: float = RUN_S) -> Driven:
     """Draw what runs of a world drive: what its wheels do by its nominal radius, and the ground under them."""
-    circumferential_mps, steer = _WHEELS[world.name](world, rng, runs, run_s)
+    speed_mps, steer = _WHEELS[world.name](world, rng, runs, run_s)
     coarse, fine = (
-        np.arange(len(circumferential_mps)),
-        np.arange(2 * EVERY * (len(circumferential_mps) - 1) + 1) / (2 * EVERY),
+        np.arange(len(speed_mps)),
+        np.arange(2 * EVERY * (len(speed_mps) - 1) + 1) / (2 * EVERY),
     )
     low = np.minimum(fine.astype(int), len(coarse) - 2)
     part = (fine - low)[:, None, None]
@@ -245,7 +256,7 @@ def driven_by(world: World, runs: int, rng: np.random.Generator, run_s: float = 
     friction = 1.0 + FRICTION_STD * rng.standard_normal(runs)
     radius_m = load_robot(world.robot).wheel_radius_m
     return Driven(
-        finer(circumferential_mps) / radius_m,
+        finer(speed_mps) / radius_m,
         finer(steer),
         slope,
         friction,
@@ -275,15 +286,15 @@ def _held_by_friction(angle: Array, most: float) -> Array:
     return out
 
 
-def runs_of(world: World, driven: Driven, seed: np.random.SeedSequence, first: int = 1) -> tuple[RunLog, ...]:
-    """Return the logs of a world: the seed draws the noise of its sensors alone."""
-    robot, link, half_s = load_robot(world.robot), world.linkage, 0.5 * STEP_S
-    rate, steer = driven.rate, np.array(driven.steer)
+def _plain_records(world: World, driven: Driven) -> Recorded:
+    """Return the motion of a plain world, and what its motors and steering do as their encoders have it."""
+    link, half_s = world.linkage, 0.5 * STEP_S
+    rate, steer, every = driven.rate, np.array(driven.steer), 2 * EVERY
     turned = np.cumsum(rate, axis=0) * half_s
     if link.backlash_rad:
         rate = np.gradient(_play(turned, link.backlash_rad), half_s, axis=0)
-    steered = slice(0, 2 if world.name == "car" else steer.shape[2])
-    if world.name in ("car", "swerve"):
+    if world.name in STEERED:
+        steered = slice(0, STEERED[world.name])
         moved = link.steer_gain * steer[..., steered]
         if link.steer_friction_rad:
             moved = _held_by_friction(moved, link.steer_friction_rad)
@@ -292,43 +303,50 @@ def runs_of(world: World, driven: Driven, seed: np.random.SeedSequence, first: i
             moved = np.concatenate([np.repeat(moved[:1], late, axis=0), moved[: len(moved) - late]])
         steer[..., steered] = moved + np.array(link.steer_offset_rad or 0.0)
     motion = integrate(world.body, rate, steer, driven.slope, driven.friction, driven.yaw_rad)
-    every = 2 * EVERY
-    rngs = [np.random.default_rng(child) for child in seed.spawn(4)]
-    streams: list[dict[str, Stream]] = [{} for _ in range(rate.shape[1])]
-    for name, kind in (
-        [("pose", sensors.pose_of)]
-        if world.name == "omni"
-        else [
-            ("imu", sensors.imu_of),
-            ("lidar", sensors.lidar_of),
-        ]
-    ):
-        for own, stream in zip(streams, kind(motion, world.sensing, rngs[len(name) % 3]), strict=True):
-            own[name] = stream
-    counted = sensors.counted(turned[::every], world.sensing)
-    time_s = np.arange(len(counted)) / sensors.WHEELS_HZ
-    names, columns = list(robot.rate_channels), _logged(world, robot, counted)
-    if world.name != "car":
-        currents = sensors.currents_of(
-            motion.pull_n, motion.load_n, driven.rate[::every], world.body.radius_m, world.motor
+    torque = sensors.torque_of(motion.pull_n, driven.rate[::every], world.body.radius_m, world.motor)
+    return Recorded(motion, turned[::every], torque, driven.steer[::every])
+
+
+def runs_of(world: World, driven: Driven, seed: np.random.SeedSequence) -> tuple[RunLog, ...]:
+    """Return the logs of a world: the seed draws the noise of its sensors alone."""
+    robot = load_robot(world.robot)
+    if world.scene is None:
+        recorded = _plain_records(world, driven)
+    else:
+        mounts = {"lidar_m": world.sensing.lidar_m, "lidar_yaw_rad": world.sensing.lidar_yaw_rad}
+        recorded = scenes.moved(
+            world.name, world.body, world.scene._replace(**mounts), world.motor.inertia_kgm2, driven
         )
+    motion, rngs = recorded.motion, [np.random.default_rng(child) for child in seed.spawn(4)]
+    kinds = (
+        {"pose": sensors.pose_of}
+        if world.name == "omni"
+        else {"imu": sensors.imu_of, "lidar": sensors.lidar_of}
+    )
+    streams: list[dict[str, Stream]] = [{} for _ in range(driven.rate.shape[1])]
+    for (name, kind), rng in zip(kinds.items(), rngs, strict=False):
+        for own, stream in zip(streams, kind(motion, world.sensing, rng), strict=True):
+            own[name] = stream
+    rate = sensors.counted(recorded.turned_rad, world.sensing)
+    time_s = motion.time_s[0] + np.arange(len(rate)) / sensors.WHEELS_HZ
+    names, columns = list(robot.rate_channels), _logged(world, robot, rate)
+    if world.name != "car":
+        currents = sensors.currents_of(recorded.torque_nm, world.motor)[::2]
         if world.name == "skid":
             currents = currents[..., :2] + currents[..., 2:]
-        shape = currents[::2].shape
-        noise = sensors.coloured(rngs[3], 0.35 if world.name != "omni" else 0.03, 0.1, shape, 0.02)
-        columns = np.concatenate([columns, currents[::2] + noise], axis=2)
+        noise = sensors.coloured(rngs[3], 0.35 if world.name != "omni" else 0.03, 0.1, currents.shape, 0.02)
+        columns = np.concatenate([columns, currents + noise], axis=2)
         names += [f"current_{wheel}_a" for wheel in robot.wheels]
-    shown = _shown_steer(world, driven.steer[::every][::2])
+    shown = _shown_steer(world, recorded.steer_rad[::2])
     if shown is not None:
-        shown = shown + world.sensing.steering_std_rad * rngs[3].standard_normal(shown.shape)
+        shown = shown + world.sensing.steering_std_rad * rngs[2].standard_normal(shown.shape)
     runs = []
     for i, own in enumerate(streams):
         own["wheels"] = Stream(time_s, columns[:, i], tuple(names))
         if shown is not None:
             own["steering"] = Stream(time_s, shown[:, i], robot.steer_channels)
-        runs.append(
-            RunLog(f"run_{first + i:02d}", robot.name, own, (Label(0.0, float(motion.time_s[-1]), "yard"),))
-        )
+        label = Label(0.0, float(motion.time_s[-1]), "yard")
+        runs.append(RunLog(f"run_{i + 1:02d}", robot.name, own, (label,)))
     return tuple(runs)
 
 
@@ -337,7 +355,7 @@ def _logged(world: World, robot: Robot, rate: Array) -> Array:
     if world.name == "skid":
         return np.asarray(0.5 * (rate[..., :2] + rate[..., 2:]) * robot.wheel_radius_m)
     if world.name == "car":
-        return np.asarray(rate[..., 2:3] * robot.wheel_radius_m)
+        return np.asarray(rate[..., -1:] * robot.wheel_radius_m)  # of the rear axle
     return np.asarray(rate * robot.motors.reduction_ratio)
 
 
@@ -368,192 +386,140 @@ class ForeignEffect(NamedTuple):
     signed: bool  #: whether it may have either sign
     right: tuple[str, ...] = ()  #: names of the catalogue that are this effect
     nearest: tuple[str, ...] = ()  #: names that come nearest, no error
+    engines: tuple[str, ...] = ("plain", "mujoco")
 
 
-def _body(**change: Callable[[Body, float], Any]) -> Callable[[World, float], World]:
-    return lambda world, size: world._replace(
-        body=world.body._replace(**{name: new(world.body, size) for name, new in change.items()})
-    )
+def _changed(part: str, **change: Callable[[Any, float], Any]) -> Callable[[World, float], World]:
+    """Return what changes fields of a part of a world, each to what it makes of that part and a size."""
 
+    def hide(world: World, size: float) -> World:
+        old = getattr(world, part)
+        return world._replace(
+            **{part: old._replace(**{name: new(old, size) for name, new in change.items()})}
+        )
 
-def _sensing(**change: Callable[[Sensing, float], Any]) -> Callable[[World, float], World]:
-    return lambda world, size: world._replace(
-        sensing=world.sensing._replace(**{name: new(world.sensing, size) for name, new in change.items()})
-    )
-
-
-def _linkage(**change: Callable[[float], Any]) -> Callable[[World, float], World]:
-    return lambda world, size: world._replace(
-        linkage=world.linkage._replace(**{name: new(size) for name, new in change.items()})
-    )
-
-
-def _motor(**change: Callable[[float], Any]) -> Callable[[World, float], World]:
-    return lambda world, size: world._replace(
-        motor=world.motor._replace(**{name: new(size) for name, new in change.items()})
-    )
+    return hide
 
 
 def _one_side(body: Body, size: float) -> Array:
     return body.radius_m * np.where(body.wheels_m[:, 1] > 0.0, 1.0 - size / 2, 1.0 + size / 2)
 
 
-def _one_wheel(body: Body, size: float) -> Array:
-    return body.radius_m * np.array([1.0 + size, 1.0, 1.0])
+def _apart(body: Body, size: float) -> Array:
+    return body.wheels_m * np.array([1.0, 1.0 + size] if len(body.wheels_m) == 4 else [1.0 + size] * 2)
+
+
+def _offset(world: World, size: float) -> World:
+    offsets = (size, size) if world.name == "car" else (0.0, size, 0.0)
+    return world._replace(linkage=world.linkage._replace(steer_offset_rad=offsets))
+
+
+def _lost(world: World, size: float) -> World:
+    fast_radps = {"car": 6.0, "omni": 5.0}.get(world.name, 2.5)
+    return world._replace(sensing=world.sensing._replace(lost_ratio=size, lost_from_radps=fast_radps))
 
 
 _ALL, _IMU, _STEERED = ("skid", "car", "swerve", "omni"), ("skid", "car", "swerve"), ("car", "swerve")
-_MOTORS = ("skid", "swerve")
+_MOTORS, _PLAIN, _SCENE = ("skid", "swerve"), ("plain",), ("mujoco",)
+_TURNING = ("effective_track", "turning_slip", "track_narrowing", "turn_drag", "turn_side_slip")
 
-EFFECTS: tuple[ForeignEffect, ...] = (
-    # in the catalogue
-    ForeignEffect(
-        "tyre_radius",
-        _ALL,
-        _body(radius_m=lambda b, e: b.radius_m * (1.0 + e)),
-        *(0.12, True, ("wheel_radius",), ("camera_scale",)),
-    ),
-    ForeignEffect("side_radius", ("skid",), _body(radius_m=_one_side), 0.08, True, ("one_sided_radius",)),
-    ForeignEffect("wheel_worn", ("swerve",), _body(radius_m=_one_wheel), 0.15, True, ("wheel_scale_1",)),
-    ForeignEffect("gyro_scale", _IMU, _sensing(gyro_ratio=lambda s, e: 1.0 + e), 0.1, True, ("gyro_scale",)),
-    ForeignEffect("imu_late", _IMU, _sensing(imu_late_s=lambda s, e: e), 0.3, False, ("imu_latency",)),
-    ForeignEffect(
-        "lidar_late",
-        _ALL,
-        _sensing(lidar_late_s=lambda s, e: s.lidar_late_s + e),
-        *(0.4, False, ("camera_latency", "lidar_latency")),
-    ),
-    ForeignEffect(
-        "lidar_moved",
-        _ALL,
-        _sensing(lidar_m=lambda s, e: (s.lidar_m[0] + 0.8 * e, s.lidar_m[1] - 0.6 * e)),
-        *(0.5, True, ("lever_arm",)),
-    ),
-    ForeignEffect("lidar_turned", _ALL, _sensing(lidar_yaw_rad=lambda s, e: e), 0.2, True, ("camera_yaw",)),
-    ForeignEffect(
-        "payload",
-        ("skid", "swerve", "omni"),
-        _body(
-            mass_kg=lambda b, e: b.mass_kg * (1.0 + e), inertia_kgm2=lambda b, e: b.inertia_kgm2 * (1.0 + e)
-        ),
-        *(1.0, False, ("payload",), ("motor_constant", "roller_friction", "scrub")),
-    ),
-    ForeignEffect(
-        "weak_magnets", _MOTORS, _motor(weak_ratio=lambda e: e), 0.4, False, ("motor_constant",), ("payload",)
-    ),
-    ForeignEffect(
-        "soft_ground",
-        _MOTORS,
-        _body(drag_ratio=lambda b, e: b.drag_ratio + e),
-        0.2,
-        False,
-        ("rolling_resistance",),
-    ),
-    ForeignEffect(
-        "wheels_apart",
-        ("skid", "omni"),
-        _body(
-            wheels_m=lambda b, e: (
-                b.wheels_m * np.array([1.0, 1.0 + e] if len(b.wheels_m) == 4 else [1.0 + e] * 2)
-            )
-        ),
-        *(0.08, True, ("effective_track", "wheel_distance"), ("turning_slip",)),
-    ),
-    ForeignEffect(
-        "steering_offset",
-        _STEERED,
-        lambda world, e: world._replace(
-            linkage=world.linkage._replace(steer_offset_rad=(e, e) if world.name == "car" else (0.0, e, 0.0))
-        ),
-        *(0.1, True, ("steering_offset_front", "steering_offset_2")),
-    ),
-    ForeignEffect(
-        "steering_late", _STEERED, _linkage(steer_late_s=lambda e: e), 0.4, False, ("steering_delay",)
-    ),
-    ForeignEffect(
-        "sticky_rollers",
-        ("omni",),
-        _body(roller_ratio=lambda b, e: b.roller_ratio + e),
-        0.2,
-        False,
-        ("roller_friction",),
-    ),
-    # outside of it, or in it since
-    ForeignEffect(
-        "gear_backlash",
-        ("skid", "swerve", "omni"),
-        _linkage(backlash_rad=lambda e: e),
-        0.3,
-        False,
-        ("drive_backlash",),
-    ),
-    ForeignEffect(
-        "wheel_eccentricity",
-        _ALL,
-        _body(eccentricity_ratio=lambda b, e: e),
-        0.12,
-        False,
-        ("wheel_eccentricity",),
-    ),
+
+def _effects() -> Iterator[ForeignEffect]:
+    each = ForeignEffect
+    body, sensing, linkage = (partial(_changed, part) for part in ("body", "sensing", "linkage"))
+    motor, scene = (partial(_changed, part) for part in ("motor", "scene"))
+
+    # that the catalogue has had from the start
+    change = body(radius_m=lambda b, e: b.radius_m * (1.0 + e))
+    yield each("tyre_radius", _ALL, change, 0.12, True, ("wheel_radius",), ("camera_scale",))
+    yield each("side_radius", ("skid",), body(radius_m=_one_side), 0.08, True, ("one_sided_radius",))
+    change = body(radius_m=lambda b, e: b.radius_m * np.array([1.0 + e, 1.0, 1.0]))
+    yield each("wheel_worn", ("swerve",), change, 0.15, True, ("wheel_scale_1",))
+    change = body(wheels_m=_apart)
+    yield each(
+        "wheels_apart", ("skid", "omni"), change, 0.15, True, ("effective_track", "wheel_distance"), _TURNING
+    )
+    change = body(
+        mass_kg=lambda b, e: b.mass_kg * (1.0 + e), inertia_kgm2=lambda b, e: b.inertia_kgm2 * (1.0 + e)
+    )
+    heavier = ("motor_constant", "roller_friction", "scrub")
+    yield each("payload", ("skid", "swerve", "omni"), change, 1.0, False, ("payload",), heavier)
+    change = body(drag_ratio=lambda b, e: b.drag_ratio + e)
+    yield each("soft_ground", _MOTORS, change, 0.2, False, ("rolling_resistance",), (), _PLAIN)
+    change = body(roller_ratio=lambda b, e: b.roller_ratio + e)
+    yield each("sticky_rollers", ("omni",), change, 0.2, False, ("roller_friction",), (), _PLAIN)
+    change = motor(weak_ratio=lambda m, e: e)
+    yield each("weak_magnets", _MOTORS, change, 0.4, False, ("motor_constant",), ("payload",))
+    yield each("gyro_scale", _IMU, sensing(gyro_ratio=lambda s, e: 1.0 + e), 0.1, True, ("gyro_scale",))
+    yield each("imu_late", _IMU, sensing(imu_late_s=lambda s, e: e), 0.3, False, ("imu_latency",))
+    change = sensing(lidar_late_s=lambda s, e: s.lidar_late_s + e)
+    yield each("lidar_late", _ALL, change, 0.4, False, ("camera_latency",))
+    change = sensing(lidar_m=lambda s, e: (s.lidar_m[0] + 0.8 * e, s.lidar_m[1] - 0.6 * e))
+    yield each("lidar_moved", _ALL, change, 0.5, True, ("lever_arm",))
+    yield each("lidar_turned", _ALL, sensing(lidar_yaw_rad=lambda s, e: e), 0.2, True, ("camera_yaw",))
+    right = ("steering_offset_front", "steering_offset_2")
+    yield each("steering_offset", _STEERED, _offset, 0.1, True, right, (), _PLAIN)
+    change = linkage(steer_late_s=lambda k, e: e)
+    yield each("steering_late", _STEERED, change, 0.4, False, ("steering_delay",), ("steering_lag",), _PLAIN)
+
+    # of scenes
+    change = scene(gear_ratio=lambda c, e: 1.0 + e)
+    yield each("gear", _ALL, change, 0.12, True, ("wheel_radius",), (), _SCENE)
+    change = scene(bearing_nm=lambda c, e: e)
+    yield each("bearings", ("skid",), change, 6.0, False, ("rolling_resistance",), (), _SCENE)
+    change = scene(roller_nms=lambda c, e: e)
+    yield each("balls_rub", ("omni",), change, 0.05, False, ("roller_friction",), ("wheel_radius",), _SCENE)
+    change = scene(steer_offset_rad=lambda c, e: e)
+    yield each("wheels_askew", ("car",), change, 0.1, True, ("steering_offset_front",), (), _SCENE)
+    change = scene(steer_backlash_rad=lambda c, e: e)
+    yield each("steering_slack", ("car",), change, 0.1, False, ("steering_backlash",), (), _SCENE)
+    change = scene(imu_pitch_rad=lambda c, e: e)
+    yield each("imu_pitched", ("skid", "car"), change, 0.1, True, ("accel_bias",), (), _SCENE)
+    # the moment that resists turning, and its currents
+    change = body(friction_ratio=lambda b, e: b.friction_ratio * (1.0 - e))
+    nearest = ("scrub", "turning_resistance", *_TURNING)
+    yield each("slippery", ("skid",), change, 0.7, False, (), nearest, _SCENE)
+    change = scene(play_rad=lambda c, e: e)
+    yield each("gear_play", ("skid",), change, 0.3, False, ("drive_backlash",), (), _SCENE)
+
+    # that the catalogue lacked when this was written
+    change = linkage(backlash_rad=lambda k, e: e)
+    yield each(
+        "gear_backlash", ("skid", "swerve", "omni"), change, 0.3, False, ("drive_backlash",), (), _PLAIN
+    )
+    change = body(eccentricity_ratio=lambda b, e: e)
+    yield each("wheel_eccentricity", _ALL, change, 0.12, False, (), (), _PLAIN)
     # friction that falls with speed is Coulomb friction at low speed
-    ForeignEffect(
-        "stick_slip", _MOTORS, _motor(crawl_ratio=lambda e: e), 8.0, False, (), ("rolling_resistance",)
-    ),
-    ForeignEffect("uneven_tread", ("skid", "car"), _body(tread_ratio=lambda b, e: e), 0.8, True),
-    ForeignEffect(
-        "gyro_warming", _IMU, _sensing(gyro_warming_radps=lambda s, e: e), 0.06, True, (), ("gyro_bias",)
-    ),
-    ForeignEffect(
-        "lidar_busy", _ALL, _sensing(lidar_late_s2pm=lambda s, e: e), 0.4, False, (), ("camera_latency",)
-    ),
+    change = motor(crawl_ratio=lambda m, e: e)
+    yield each("stick_slip", _MOTORS, change, 8.0, False, (), ("rolling_resistance",), _PLAIN)
+    yield each("uneven_tread", ("skid", "car"), body(tread_ratio=lambda b, e: e), 0.8, True, (), (), _PLAIN)
+    change = sensing(gyro_warming_radps=lambda s, e: e)
+    yield each("gyro_warming", _IMU, change, 0.06, True, (), ("gyro_bias",), _PLAIN)
+    change = sensing(lidar_late_s2pm=lambda s, e: e)
+    yield each("lidar_busy", _ALL, change, 0.4, False, (), ("camera_latency",), _PLAIN)
     # the driven axle's radius by its load: by acceleration and slope
-    ForeignEffect(
-        "soft_tyres", ("car",), _body(squash_ratio=lambda b, e: e), 0.5, False, (), ("force_slip",)
-    ),
-    ForeignEffect(
-        "steering_friction",
-        _STEERED,
-        _linkage(steer_friction_rad=lambda e: e),
-        *(0.15, False, (), ("steering_backlash", "steering_delay", "steering_lag")),
-    ),
-    ForeignEffect(
-        "lost_counts",
-        _ALL,
-        lambda world, e: world._replace(
-            sensing=world.sensing._replace(
-                lost_ratio=e, lost_from_radps={"car": 6.0, "omni": 5.0}.get(world.name, 2.5)
-            )
-        ),
-        *(0.5, False, (), ("wheel_radius",)),
-    ),
-    ForeignEffect("squat", _IMU, _sensing(squat_radpmps2=lambda s, e: e), 0.06, False),
-    ForeignEffect(
-        "wind",
-        _IMU,
-        lambda world, e: world._replace(
-            body=world.body._replace(wind_n=(0.8 * e * world.body.mass_kg, 0.6 * e * world.body.mass_kg))
-        ),
-        *(1.5, True),
-    ),
-    ForeignEffect(
-        "steering_gain", _STEERED, _linkage(steer_gain=lambda e: 1.0 + e), 0.2, True, ("steering_gain",)
-    ),
-    ForeignEffect(
-        "gyro_cubic",
-        _IMU,
-        _sensing(gyro_cubic_s2=lambda s, e: e),
-        0.15,
-        True,
-        ("gyro_cubic",),
-        ("gyro_scale",),
-    ),
-)
-"""By robots: a name that the catalogue of a robot's drive has makes an effect one of the catalogue."""
+    change = body(squash_ratio=lambda b, e: e)
+    yield each("soft_tyres", ("car",), change, 0.5, False, (), ("force_slip",), _PLAIN)
+    change = linkage(steer_friction_rad=lambda k, e: e)
+    nearest = ("steering_backlash", "steering_delay", "steering_lag")
+    yield each("steering_friction", _STEERED, change, 0.15, False, (), nearest, _PLAIN)
+    yield each("lost_counts", _ALL, _lost, 0.5, False, (), ("wheel_radius",), _PLAIN)
+    yield each("squat", _IMU, sensing(squat_radpmps2=lambda s, e: e), 0.06, False, (), (), _PLAIN)
+    change = body(wind_n=lambda b, e: (0.8 * e * b.mass_kg, 0.6 * e * b.mass_kg))
+    yield each("wind", _IMU, change, 1.5, True, (), (), _PLAIN)
+    change = linkage(steer_gain=lambda k, e: 1.0 + e)
+    yield each("steering_gain", _STEERED, change, 0.2, True, ("steering_gain",), ("wheelbase",), _PLAIN)
+    change = sensing(gyro_cubic_s2=lambda s, e: e)
+    yield each("gyro_cubic", _IMU, change, 0.15, True, ("gyro_nonlinearity",), ("gyro_scale",), _PLAIN)
+
+
+EFFECTS = tuple(_effects())
+"""One is of the catalogue where that of a robot's drive has a right name."""
 
 
 def effects_of(engine: str, world: str) -> tuple[ForeignEffect, ...]:
     """Return the effects of a world."""
-    return tuple(effect for effect in EFFECTS if world in effect.robots)
+    return tuple(effect for effect in EFFECTS if engine in effect.engines and world in effect.robots)
 
 
 def effect_of(engine: str, world: str, name: str) -> ForeignEffect:
