@@ -134,7 +134,7 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
     """Yield what a user decides by: faults, causes with intervals, rivals, and what was not detectable."""
     diagnosis = result.diagnosis
     for fault in diagnosis.faults:
-        yield Text(f"Fault of the logs, repaired before anything was compared: {fault.sentence}", "warning")
+        yield Text(f"{fault.heading}: {fault.sentence}", "warning")
     if diagnosis.excluded_runs:
         yield Text(f"Runs that were excluded as unfit: {_ids(diagnosis.excluded_runs)}.", "warning")
     for statement in result.statements[:STATED]:  # what states something comes first

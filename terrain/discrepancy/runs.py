@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -157,6 +158,12 @@ BACKWARD_MPS, MIN_BACKWARD = 0.02, 5
 PARALLEL = 0.95
 
 
+#: Channels of an IMU, axis by axis.
+IMU_AXES = tuple(
+    f"{kind}_{axis}_{unit}" for kind, unit in (("gyro", "radps"), ("accel", "mps2")) for axis in "xyz"
+)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Signals:
     """A run on one clock."""
@@ -176,6 +183,8 @@ class Signals:
     measured: Array
     session: str = ""  #: that the run is part of; empty where that is not known
     place: float = math.nan  #: in the order in which runs were driven, from 0; NaN: as they are given
+    #: (n, len(IMU_AXES)) all axes of the IMU, which tell exchanged axes; (n, 0) where they are not logged
+    axes: Array = field(default_factory=partial(np.empty, (0, 0)))
 
     def __len__(self) -> int:
         return len(self.measured)
@@ -340,7 +349,10 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
         )
     terrain = run.terrains[0] if len(run.terrains) == 1 else ""
     on_clock = resampled(wheels.time_s, speeds), steer, tilt[:, 0], tilt[:, 1], measured
-    return Signals(run.run_id, terrain, 1 / rate_hz, float(time_s[0]), *on_clock, run.session)
+    axes = np.empty((n, 0))
+    if imu is not None and set(IMU_AXES) <= set(imu.channels):
+        axes = resampled(imu.time_s, imu.columns(IMU_AXES))
+    return Signals(run.run_id, terrain, 1 / rate_hz, float(time_s[0]), *on_clock, run.session, axes=axes)
 
 
 def _measurements(

@@ -12,15 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.discrepancy.health.agreement import AMPS, A, G, H, T, X, Y
-from terrain.discrepancy.runs import Signals
+from terrain.discrepancy.health.agreement import AMPS, MOTION, A, G, H, T, X, Y
+from terrain.discrepancy.health.samples import clipped, held
+from terrain.discrepancy.runs import IMU_AXES, Signals
 from terrain.effects import CHANNELS
 from terrain.records import Array
 from terrain.robots import Robot
-
-#: A fault of a logger is in that ratio of the runs at the least: units and zeros are set once, and a run in a hundred
-#: that is off is one whose sensor failed, which is no reason to repair it.
-MIN_FAULTY_RATIO = 0.05
 
 
 class FaultKind(StrEnum):
@@ -30,6 +27,22 @@ class FaultKind(StrEnum):
     UNIT = "unit"
     SWAPPED = "swapped"
     OFFSET = "offset"
+    AXES = "axes"
+    DROPOUT = "dropout"
+    SATURATION = "saturation"
+    DRIFT = "drift"
+
+
+class FaultStatus(StrEnum):
+    """Whether a log is changed for a fault: only where runs that it was not found in confirm it.
+
+    ``undecided``: the logs have no channel that tells it from other readings, which are given.  ``not confirmed``: so
+    few runs show it that none is left to confirm it; nothing is changed.
+    """
+
+    CONFIRMED = "confirmed"
+    UNDECIDED = "undecided"
+    NOT_CONFIRMED = "not confirmed"
 
 
 class Column(StrEnum):
@@ -89,11 +102,18 @@ class Change(NamedTuple):
     wheel: int = -1  #: which wheel alone; -1 for all
     offset: float = 0.0  #: that is added
     pair: tuple[int, int] = (0, 1)  #: wheels that are exchanged
+    axis: int = -1  #: place in IMU_AXES of the axis that is in the column's place
+    drift: float = 0.0  #: that is added each second of a run
 
     @property
     def of_wheels(self) -> bool:
         """Whether it changes what drives the simulation."""
         return self.column in (Column.WHEELS, Column.SIDES)
+
+    @property
+    def of_samples(self) -> bool:
+        """Whether it takes samples of a run, and not all rows alike."""
+        return self.kind in (FaultKind.AXES, FaultKind.DROPOUT, FaultKind.SATURATION, FaultKind.DRIFT)
 
     def measured(self, values: Array) -> Array:
         """Return measured channels (n, channels) as they are without the fault."""
@@ -109,7 +129,23 @@ class Change(NamedTuple):
 
     def applied(self, run: Signals) -> Signals:
         """Return a run without the fault."""
+        own = list(KINDS[self.column].channels)
+        if self.kind in (FaultKind.DROPOUT, FaultKind.SATURATION):
+            measured, is_held = run.measured.copy(), self.kind is FaultKind.DROPOUT
+            for c in own:
+                values = measured[:, c]
+                mask = held(values, run.dt_s, c in MOTION) if is_held else clipped(values, run.dt_s)
+                measured[mask, c] = np.nan
+            return replace(run, measured=measured)
+        if self.kind is FaultKind.AXES:
+            if not run.axes.size:
+                return run
+            measured = run.measured.copy()
+            measured[:, own[0]] = self.factor * run.axes[:, self.axis]
+            return replace(run, measured=measured)
         measured = self.measured(run.measured)
+        if self.kind is FaultKind.DRIFT:
+            measured[:, own[0]] += self.drift * (run.time_s - run.start_s)
         if not self.of_wheels:
             return replace(run, measured=measured)
         n = run.wheel_speed_mps.shape[1]
@@ -131,17 +167,35 @@ class Fault(NamedTuple):
     run_ids: tuple[str, ...]
     sentence: str
     repair: str
+    status: FaultStatus = FaultStatus.CONFIRMED
+    rivals: Changes = ()  #: other readings that the logs cannot distinguish from it
+
+    @property
+    def heading(self) -> str:
+        """What was done about it, in words."""
+        return {
+            FaultStatus.CONFIRMED: "Fault of the logs, repaired before anything was compared",
+            FaultStatus.UNDECIDED: "Fault of the logs, of which it cannot be told which column has it",
+            FaultStatus.NOT_CONFIRMED: "Fault of the logs that no other run confirms, so that nothing was changed",
+        }[self.status]
 
     def as_json(self) -> dict[str, Any]:
         """Return the fields as JSON names them."""
         change = {name: getattr(self.change, name) for name in ("kind", "column", "factor")}
-        return {**change, "runs": self.run_ids, "sentence": self.sentence, "repair": self.repair}
+        text = {"sentence": self.sentence, "repair": self.repair, "status": self.status}
+        return {**change, "runs": self.run_ids, **text}
 
 
 def repaired(signals: Sequence[Signals], faults: Sequence[Fault]) -> tuple[Signals, ...]:
-    """Return runs without faults, in the same order: changed, or left out where it is not clear how."""
+    """Return runs without faults, in the same order.
+
+    Where readings that are mirror images cannot be distinguished, either gives the same comparison but for the side; of
+    other readings the channel is left out.  What no other run confirms is left as it is.
+    """
     fixed = list(signals)
     for fault in faults:
+        if fault.status is FaultStatus.NOT_CONFIRMED:
+            continue
         fixed = [fault.change.applied(run) if run.run_id in fault.run_ids else run for run in fixed]
     return tuple(fixed)
 
@@ -190,6 +244,21 @@ def change_in_words(change: Change, robot: Robot) -> tuple[str, str]:
             names = " and ".join(robot.rate_channels[i] for i in change.pair)
             what = "wheel speeds of {} and {} are exchanged".format(*(robot.wheels[i] for i in change.pair))
         return what, f"exchange {names} (mapping file: exchange their columns)"
+    if change.kind in (FaultKind.DROPOUT, FaultKind.SATURATION):
+        first = logged.split(" and ")[0]
+        how = (
+            "holds its value for seconds"
+            if change.kind is FaultKind.DROPOUT
+            else "is at the end of its range"
+        )
+        return f"{name} {how} while it should change", f"these samples of {first} are left out"
+    if change.kind is FaultKind.AXES:
+        axis, own = IMU_AXES[change.axis], IMU_AXES[3 * (change.axis // 3) + (2 if change.axis < 3 else 0)]
+        sign = "" if change.factor > 0 else ", with its sign turned"
+        return f"axes of {name} are exchanged: {own} is in {axis}{sign}", f"take {own} from {axis}{sign}"
+    if change.kind is FaultKind.DRIFT:
+        size, first = f"{-change.drift:.2g} {kind.si} a second", logged.split(" and ")[0]
+        return f"the zero of {name} drifts by {size} in each run", f"subtract {size} from {first}"
     if change.kind is FaultKind.OFFSET:
         size, first = f"{-change.offset:.3g} {kind.si}", logged.split(" and ")[0]
         hint = f"mapping file: offset: {change.offset:.3g}"

@@ -8,15 +8,28 @@ no effect of the catalogue does.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+
+import numpy as np
 
 from terrain.discrepancy.clocks import Latencies
 from terrain.discrepancy.health.agreement import Agreement, agreement_of, on_own_clocks
-from terrain.discrepancy.health.fault import Change, Fault
+from terrain.discrepancy.health.fault import (
+    KINDS,
+    Change,
+    Fault,
+    FaultKind,
+    FaultStatus,
+    fault_of,
+    session_of,
+)
 from terrain.discrepancy.health.offsets import offset_faults
 from terrain.discrepancy.health.readings import Reading, reading_of, turned_fault
+from terrain.discrepancy.health.samples import lost_samples
 from terrain.discrepancy.health.units import unit_faults
 from terrain.discrepancy.runs import LowPass, Rows, Signals, Simulation, rows_of
+from terrain.robots import Robot
 
 #: Signs and exchanges that are searched one after the other; logs with more are no logs of this robot.
 MAX_FAULTS = 4
@@ -35,16 +48,18 @@ def faults_of(
     """
     runs, logs, robot = list(signals), list(rows), simulation.robot
     ids, faults = [run.run_id for run in rows], []
+    sessions = [run.session or session_of(run.run_id) for run in signals]
 
     def without(change: Change, i: int) -> Rows:
         """Return the rows of a run after a change; one of the wheels is simulated again."""
-        if not change.of_wheels:
+        if not change.of_wheels and not change.of_samples:
             return logs[i]._replace(measured=change.measured(logs[i].measured))
         run = change.applied(runs[i])
         return rows_of(run, simulation.planar_on(run.terrain), simulation.vector, (), low_pass)
 
     def repair(fault: Fault) -> None:
-        for i in (i for i, run_id in enumerate(ids) if run_id in fault.run_ids):
+        is_changed = fault.status is not FaultStatus.NOT_CONFIRMED
+        for i in (i for i, run_id in enumerate(ids) if run_id in fault.run_ids and is_changed):
             logs[i] = without(fault.change, i)
             runs[i] = fault.change.applied(runs[i])
         faults.append(fault)
@@ -52,7 +67,9 @@ def faults_of(
     def responses() -> tuple[Rows, ...]:
         return on_own_clocks(logs, latencies)
 
-    while len(faults) < MAX_FAULTS:
+    for fault in _lost_samples(runs, logs, ids, robot):
+        repair(fault)
+    for _ in range(MAX_FAULTS):
         before = agreement_of(responses())
 
         def tried(change: Change, places: Sequence[int], before: Agreement = before) -> Reading:
@@ -63,10 +80,29 @@ def faults_of(
                 whole[list(places)] = part
             return reading_of(change, before, after)
 
-        turned = turned_fault(before, tried, ids, robot)
+        turned = turned_fault(before, tried, ids, sessions, robot)
         if turned is None:
             break
         repair(turned)
-    for fault in unit_faults(responses(), robot):
+        if turned.status is FaultStatus.NOT_CONFIRMED:
+            break
+    for fault in unit_faults(responses(), sessions, robot):
         repair(fault)
-    return (*faults, *offset_faults(responses(), robot))
+    return (*faults, *offset_faults(responses(), sessions, robot))
+
+
+def _lost_samples(
+    signals: Sequence[Signals], rows: Sequence[Rows], ids: Sequence[str], robot: Robot
+) -> tuple[Fault, ...]:
+    """Return the columns that hold a value, or are clipped, in some runs: these samples are left out."""
+    seconds: dict[Change, dict[int, float]] = {}
+    columns = {c: column for column, kind in KINDS.items() for c in kind.channels}
+    for i, (run, beside) in enumerate(zip(signals, rows, strict=True)):
+        for lost in lost_samples(run, beside):
+            kind = FaultKind.SATURATION if lost.is_clipped else FaultKind.DROPOUT
+            of_runs = seconds.setdefault(Change(kind, columns[lost.channel], math.nan), {})
+            of_runs[i] = max(of_runs.get(i, 0.0), lost.seconds)
+    return tuple(
+        fault_of(change, [*of], ids, f": for {np.median([*of.values()]):.1f} s of a run", robot)
+        for change, of in seconds.items()
+    )

@@ -7,42 +7,69 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from terrain.discrepancy.health.agreement import LEAST
-from terrain.discrepancy.health.fault import KINDS, MIN_FAULTY_RATIO, Change, Fault, FaultKind, fault_of
+from terrain.discrepancy.health.agreement import LEAST, G, H
+from terrain.discrepancy.health.fault import KINDS, Change, Fault, FaultKind, FaultStatus, fault_of
+from terrain.discrepancy.health.sessions import faulty_runs, halves
 from terrain.discrepancy.runs import Rows
 from terrain.robots import Robot
 
 OFFSET_SIGMAS = 4.0  #: An offset is over the largest by so many standard deviations.
 MIN_ROWS = 10
+#: A constant is identified only where the prediction comes so near to zero, over its range: beyond, it is that of the
+#: gain.
+NEAR_ZERO = 0.1
+SAME_RATIO = 0.25  #: Offsets of two halves of the runs differ by less, relative.
+WITNESS = {G: H, H: G}  #: Channel that measures the same motion: what it has too is no offset of a sensor.
 
 
-def offset_faults(runs: Sequence[Rows], robot: Robot) -> tuple[Fault, ...]:
-    """Return columns with an offset that no effect has, in all runs or in some of them.
+def offset_faults(runs: Sequence[Rows], sessions: Sequence[str], robot: Robot) -> tuple[Fault, ...]:
+    """Return columns with an offset that no effect has, of sessions or of successive runs of one.
 
-    It is what a channel measures where nothing is predicted; of one motion throughout, a gain looks the same.
+    It is what a channel measures where nothing is predicted.  It is within the range of what was measured, it is the
+    same in two halves of the runs, and no channel of the same motion has it.
     """
-    faults = []
+    faults, ids = [], [run.run_id for run in runs]
     for column, kind in KINDS.items():
         if not math.isfinite(kind.largest):
             continue
-        c, value, std = kind.channels[0], *np.full((2, len(runs)), np.nan)
-        for i, run in enumerate(runs):
-            known = np.isfinite(run.measured[:, c]) & np.isfinite(run.predicted[:, c])
-            measured, predicted = run.measured[known, c], run.predicted[known, c]
-            if known.sum() < MIN_ROWS:
-                continue
-            varies = np.std(predicted) > LEAST[c]
-            if varies or not np.sqrt(np.mean(predicted**2)) > LEAST[c]:
-                basis = np.column_stack([np.ones(measured.size), *([predicted] if varies else [])])
-                fit, *_ = np.linalg.lstsq(basis, measured, rcond=None)
-                n_independent = max(
-                    measured.size * min(run.period_s, 1.0), 1.0
-                )  # what is left changes within seconds
-                spread = np.linalg.inv(basis.T @ basis / measured.size)[0, 0] / n_independent
-                value[i], std[i] = fit[0], np.std(measured - basis @ fit) * np.sqrt(spread)
-        has = np.flatnonzero(np.abs(value) > kind.largest + OFFSET_SIGMAS * std)
-        if has.size >= max(MIN_FAULTY_RATIO * np.isfinite(value).sum(), 1):
-            change = Change(FaultKind.OFFSET, column, offset=-float(np.median(value[has])))
-            below = f", where a sensor's is below {kind.largest:g}"
-            faults.append(fault_of(change, has.tolist(), [run.run_id for run in runs], below, robot))
+        c = kind.channels[0]
+        constants = np.array([constant_of(run, c) for run in runs])
+        value, std = constants.T
+        far = np.abs(value) > kind.largest + OFFSET_SIGMAS * std
+        if c in WITNESS:
+            other = np.array([constant_of(run, WITNESS[c])[0] for run in runs])
+            far &= ~(np.abs(other - value) < 0.5 * np.abs(value))
+        has = faulty_runs(sessions, np.where(np.isfinite(value), np.where(far, 1, -1), 0))
+        shown = [i for i in has if far[i]]
+        parts = [float(np.median(value[part])) if part else math.nan for part in halves(shown)]
+        if not shown or abs(parts[1] - parts[0]) > SAME_RATIO * abs(parts[0]):
+            continue
+        change = Change(FaultKind.OFFSET, column, offset=-float(np.median(value[shown])))
+        fault = fault_of(change, has, ids, f", where a sensor's is below {kind.largest:g}", robot)
+        confirmed = FaultStatus.CONFIRMED if len(shown) > 1 else FaultStatus.NOT_CONFIRMED
+        faults.append(fault._replace(status=confirmed))
     return tuple(faults)
+
+
+def constant_of(run: Rows, channel: int) -> tuple[float, float]:
+    """Return what a channel measures where nothing is predicted, and its standard deviation.
+
+    They are NaN where the prediction does not come near zero, or where the constant is out of the range of what was
+    measured: then it is an extrapolation.
+    """
+    known = np.isfinite(run.measured[:, channel]) & np.isfinite(run.predicted[:, channel])
+    measured, predicted = run.measured[known, channel], run.predicted[known, channel]
+    if known.sum() < MIN_ROWS:
+        return math.nan, math.nan
+    low, high = float(predicted.min()), float(predicted.max())
+    margin = NEAR_ZERO * (high - low) + LEAST[channel]
+    if low > margin or high < -margin:
+        return math.nan, math.nan
+    varies = np.std(predicted) > LEAST[channel]
+    basis = np.column_stack([np.ones(measured.size), *([predicted] if varies else [])])
+    fit, *_ = np.linalg.lstsq(basis, measured, rcond=None)
+    n_independent = max(measured.size * min(run.period_s, 1.0), 1.0)  # what is left changes within seconds
+    spread = np.linalg.inv(basis.T @ basis / measured.size)[0, 0] / n_independent
+    if not measured.min() <= fit[0] <= measured.max():
+        return math.nan, math.nan
+    return float(fit[0]), float(np.std(measured - basis @ fit) * np.sqrt(spread))

@@ -16,10 +16,11 @@ from terrain.discrepancy.health.fault import (
     Column,
     Fault,
     FaultKind,
+    FaultStatus,
     change_in_words,
     fault_of,
-    session_of,
 )
+from terrain.discrepancy.health.sessions import faulty_runs, halves
 from terrain.records import Array
 from terrain.robots import Robot
 
@@ -40,6 +41,7 @@ LOSS = 0.1  #: Largest loss of correlation of any other channel under a reading 
 GAIN = 20.0
 #: Readings whose gains differ by less, or by less than that ratio, cannot be distinguished.
 TIE, TIE_RATIO = 10.0, 0.03
+MIN_MENDED_RATIO = 0.8  #: Ratio of the runs that a reading has to mend, to be as good as another.
 
 WORDS = (
     *("gyro", "speed", "lateral speed", "accelerometer"),
@@ -67,6 +69,11 @@ def candidate_changes(robot: Robot) -> Changes:
         changes += [Change(swapped, column) for column in (Column.CURRENTS, Column.WHEELS, Column.SIDES)]
     else:
         changes += [Change(swapped, Column.WHEELS, pair=pair) for pair in combinations(range(n_wheels), 2)]
+    for column, z in ((Column.GYRO, 2), (Column.ACCEL, 3)):
+        others = [axis for axis in range(3 * (z // 3), 3 * (z // 3) + 3) if axis != z]
+        changes += [
+            Change(FaultKind.AXES, column, turn, axis=axis) for axis in others for turn in (1.0, -1.0)
+        ]
     each = range(n_wheels) if n_wheels > 1 else ()
     return (*changes, *(Change(sign, Column.WHEELS, -1.0, wheel) for wheel in (-1, *each)))
 
@@ -84,52 +91,69 @@ def reading_of(change: Change, before: Agreement, after: Agreement) -> Reading:
 
 
 def turned_fault(
-    before: Agreement, tried: Callable[[Change, Sequence[int]], Reading], ids: Sequence[str], robot: Robot
+    before: Agreement,
+    tried: Callable[[Change, Sequence[int]], Reading],
+    ids: Sequence[str],
+    sessions: Sequence[str],
+    robot: Robot,
 ) -> Fault | None:
     """Return the sign or exchange that mends most, or None if there is none.
 
-    It is the reading that gains most over the runs that it mends.  Those that are as good on the same runs are mirror
-    images, left for right or ahead for back: the change of fewest columns is taken, and the diagnosis is that of
-    either but for the side.  The runs that have the fault are those that it suits, and of their sessions those that
-    cannot say: a run that drives straight measures no sign of a gyro; it has that of the others.
+    It is the reading that gains most over the runs that it mends, of those that whole sessions or successive runs have,
+    and that two halves of these runs find each by itself.  Readings that are as good on the same runs are mirror
+    images, left for right or ahead for back: no channel tells which it is, and the diagnosis is that of either but for
+    the side.
     """
-    old = before.correlation
-    fit = old[:, FOLLOWERS]
+    fit = before.correlation[:, FOLLOWERS]
     suspects = np.flatnonzero(((fit != 0.0) & (fit < RIGHT)).any(axis=1)).tolist()
     readings = [tried(change, suspects) for change in candidate_changes(robot)] if suspects else []
-    first = max(readings, key=lambda reading: float(reading.gain[reading.mends].sum()), default=None)
-    if first is None or not first.mends.any():
-        return None
-    most = float(first.gain[first.mends].sum())
-    change, *rivals = (
-        reading.change
-        for reading in readings
-        if reading.mends[first.mends].all()
-        and most - float(reading.gain[first.mends].sum()) < max(TIE, TIE_RATIO * most)
-    )
-    best = tried(change, range(len(ids)))
-    rise, session = best.correlation - old, [session_of(run_id) for run_id in ids]
-    shift = np.median(np.abs(rise)[best.mends], axis=0)
-    shows = [c for c in FOLLOWERS if shift[c] > RISE]
-    has = set(np.flatnonzero(best.suits).tolist())
-    for name in {session[i] for i in has}:
-        members = [i for i in range(len(ids)) if session[i] == name]
-        if all(i in has for i in members if (np.abs(old[i, shows]) > RIGHT).any()):
-            has |= set(members)
-    # how it is seen: the gains of the channels that it turns
-    shown, words = [i for i in sorted(has) if best.mends[i]], []
-    gains, asked = before.gain[shown], (old[shown] != 0.0) & np.isfinite(before.gain[shown])
+    readings = [reading for reading in readings if reading.mends.any()]
+    for first in sorted(readings, key=lambda reading: -float(reading.gain[reading.mends].sum())):
+        change, *rivals = _equal_readings(readings, np.flatnonzero(first.mends).tolist()) or [first.change]
+        best = tried(change, range(len(ids)))
+        votes = np.where(best.suits, 1, np.where(best.gain < -GAIN, -1, 0))
+        has = faulty_runs(sessions, votes)
+        shown = [i for i in has if best.mends[i]]
+        if not shown:
+            continue
+        parts, equal = halves(shown), {change, *rivals}
+        if parts[1] and not all(equal & {*_equal_readings(readings, part)} for part in parts):
+            continue
+        seen = _evidence(before, best, shown)
+        if rivals:
+            others = " or ".join(change_in_words(rival, robot)[0] for rival in rivals)
+            seen += f" (these channels cannot distinguish it from another reading: {others})"
+        fault = fault_of(change, has, ids, seen, robot)
+        if not parts[1]:
+            return fault._replace(status=FaultStatus.NOT_CONFIRMED)
+        return fault._replace(status=FaultStatus.UNDECIDED, rivals=tuple(rivals)) if rivals else fault
+    return None
+
+
+def _equal_readings(readings: Sequence[Reading], places: Sequence[int]) -> list[Change]:
+    """Return the readings that gain most in some runs, of those that mend all of them, and those that are as good."""
+    whole = [reading for reading in readings if reading.mends[places].mean() > MIN_MENDED_RATIO]
+    gains = [float(reading.gain[places].sum()) for reading in whole]
+    most = max(gains, default=0.0)
+    return [
+        each.change
+        for each, gain in zip(whole, gains, strict=True)
+        if most - gain < max(TIE, TIE_RATIO * most)
+    ]
+
+
+def _evidence(before: Agreement, best: Reading, shown: Sequence[int]) -> str:
+    """Return how a reading is seen, in words: the gains of the channels that it turns, in the runs that it mends."""
+    old, change, words = before.correlation[shown], best.change, []
+    gains, rise = before.gain[shown], best.correlation[shown] - old
+    asked = (old != 0.0) & np.isfinite(gains)
     for c in FOLLOWERS:
         on = asked[:, c]
         own = c in KINDS[change.column].channels or change.of_wheels
-        if own and on.any() and np.median(rise[shown][on, c]) > RISE:
+        if own and on.any() and np.median(rise[on, c]) > RISE:
             text = f"the {WORDS[c]} follows the wheels with the factor {np.median(gains[on, c]):.2f}"
             both = on & np.isfinite(gains[:, H])
             if change.column is Column.GYRO and both.any():
                 text += f", and the heading rate with {float(np.median(gains[both, c] / gains[both, H])):.2f}"
             words.append(text)
-    seen = f": {' and '.join(words)}"
-    if rivals:
-        others = " or ".join(change_in_words(rival, robot)[0] for rival in rivals)
-        seen += f" (these channels cannot distinguish it from another reading: {others})"
-    return fault_of(change, sorted(has), ids, seen, robot)
+    return f": {' and '.join(words)}"

@@ -26,10 +26,10 @@ from terrain.discrepancy.health.agreement import (
     on_own_clocks,
 )
 from terrain.discrepancy.health.response import FOLLOWS, STRETCH_S, common_gains, odd_runs, stalled_runs
+from terrain.discrepancy.health.samples import MARGIN_S, lost_samples
 from terrain.discrepancy.runs import UNLIKE, Excluded, Rows, Signals
 from terrain.effects import CHANNELS, INDEX
 from terrain.records import Array
-from terrain.signals import true_stretches
 
 #: A clock is a run's own if it is off by the first, and by so many times its error and the scatter of the others, which
 #: is the third at the least.
@@ -41,15 +41,6 @@ STILL_MPS, VARIES_MPS, MOVING_MPS = 0.002, 0.05, 0.2
 OFF_RATIO = 1.5
 #: A channel is dead in a run that has some of it but less than the first, the others over the second.
 MIN_FINITE_RATIO, USUAL_FINITE_RATIO = 0.3, 0.7
-#: A channel is frozen if it is constant for the first at a time, and clipped if it is at its extreme for the second in
-#: all and the third of a run, while the prediction varies.
-FROZEN_S, CLIPPED_S, CLIPPED_RATIO = 2.0, 1.0, 0.03
-
-MARGIN_S = 0.6  #: Tolerance of the time at which a predicted change arrives.
-#: Of what is expected meanwhile: range and spread over its spread in the run.
-FROZEN_RANGE, CLIPPED_SPREAD = 0.5, 0.1
-#: The end of a range is so far out at the least, over the largest size: idle currents rest at the other.
-FAR_END = 0.5
 
 
 class Clock(NamedTuple):
@@ -74,7 +65,7 @@ def unfit_runs(
     runs = on_own_clocks(info.rows, shift)
     follows, every = agreement_of(runs), range(len(runs))
     has_clock = [bool(known.any()) for known in np.isfinite(shift.lag_s)]
-    reasons = _frozen(signals, info.rows)
+    reasons = _lost(signals, info.rows)
     reasons |= stalled_runs(signals, runs, follows, has_clock, MAX_LAG_S + MARGIN_S - STRETCH_S)
     reasons |= _late(info, shift) | _dead(signals, runs, follows)  # the last of these counts
     reasons |= odd_runs(runs, follows, [i for i in every if i not in reasons])
@@ -89,27 +80,13 @@ def clocks_of(info: Evidence, shift: Shift) -> tuple[Clock, ...]:
     return tuple(map(Clock, (run.run_id for run in info.rows), offset_s.tolist(), std_s.tolist()))
 
 
-def _frozen(signals: Sequence[Signals], rows: Sequence[Rows]) -> dict[int, str]:
+def _lost(signals: Sequence[Signals], rows: Sequence[Rows]) -> dict[int, str]:
     """Return runs with a channel that is constant, or clipped, while the prediction varies."""
     reasons: dict[int, str] = {}
     for i, (run, beside) in enumerate(zip(signals, rows, strict=True)):
-        for c in np.flatnonzero(np.isfinite(run.measured).any(axis=0)):
-            values, expected = run.measured[:, c], beside.predicted[:, c]
-            spread, name = float(np.std(expected)), CHANNELS[c]
-            if not spread > 0:
-                continue
-            for start_s, end_s in true_stretches(values[1:] == values[:-1]) * run.dt_s:
-                inside = (beside.time_s > start_s + MARGIN_S) & (beside.time_s < end_s - MARGIN_S)
-                if end_s - start_s > FROZEN_S and np.ptp(expected[inside]) > FROZEN_RANGE * spread:
-                    reasons[i] = f"its {name} is frozen for {end_s - start_s:.1f} s while it should change"
-            for end in (np.nanmax(values), np.nanmin(values)):
-                there = np.flatnonzero(values == end)
-                if len(there) < max(CLIPPED_S / run.dt_s, CLIPPED_RATIO * len(values)):
-                    continue
-                if abs(end) < FAR_END * np.nanmax(np.abs(values)):  # a value at rest is no end of a range
-                    continue
-                if np.std(np.interp(there * run.dt_s, beside.time_s, expected)) > CLIPPED_SPREAD * spread:
-                    reasons[i] = f"its {name} is clipped at {end:.3g} for {len(there) * run.dt_s:.1f} s"
+        for lost in lost_samples(run, beside):
+            how = f"is clipped at {lost.value:.3g}" if lost.is_clipped else "is frozen"
+            reasons[i] = f"its {CHANNELS[lost.channel]} {how} for {lost.seconds:.1f} s while it should change"
     return reasons
 
 

@@ -11,15 +11,16 @@ import numpy as np
 from terrain.discrepancy.health.agreement import AMPS, A, G, H, X, agreement_of, medians
 from terrain.discrepancy.health.fault import (
     KINDS,
-    MIN_FAULTY_RATIO,
     Change,
     Changes,
     Column,
     Fault,
     FaultKind,
+    FaultStatus,
     change_in_words,
     fault_of,
 )
+from terrain.discrepancy.health.sessions import faulty_runs, halves
 from terrain.discrepancy.runs import Rows
 from terrain.records import Array
 from terrain.robots import Robot
@@ -47,12 +48,16 @@ CURRENT_GAIN = (0.7, 1.2)
 COST = 16.0
 LEFT = 9.0  #: Cost of the gains under the right reading, at most: three standard deviations.
 UNIT_TIE = 1.5  #: Readings whose costs differ by less cannot be distinguished: their odds are within 2.
+#: A unit is that of all runs if so many of those that measure its column show it; a wheel that slips as if it was read
+#: in another unit does so by a factor that scatters, in the logarithm, over the second: but none slips by e^ the third.
+MIN_SHOWN_RATIO, STEADY, GROSS = 1 / 3, 0.25, 3.0
 #: Ratio of runs without a fault, from which they are what the others are compared with.
 MIN_USUAL_RATIO = 0.2
 #: A run of another unit than the others agrees with them after its repair: within so many times their scatter, the
 #: second at the least and the first at the most, in the logarithm.  Where its motion would be too small it is the
 #: second, since a run may slip or stall, by any factor.
 NEAR, TIGHT, SCATTERS = 0.35, 0.1, 3.0
+MIN_SCATTER_RUNS = 3
 #: Correlation of the channels of such a run, if it is another unit and nothing that changes over a run.
 CLEAR_FIT = 0.95
 
@@ -70,13 +75,14 @@ _MOVING = np.array([c != AMPS for c in KEYS])
 Options = tuple[list[Changes], Array]
 
 
-def unit_faults(runs: Sequence[Rows], robot: Robot) -> tuple[Fault, ...]:
-    """Return columns whose unit is not that of their name, in all runs or in some of them."""
+def unit_faults(runs: Sequence[Rows], sessions: Sequence[str], robot: Robot) -> tuple[Fault, ...]:
+    """Return columns whose unit is not that of their name, in all runs, in sessions, or in successive runs of one."""
     follows, keys, ids = agreement_of(runs), list(KEYS), [run.run_id for run in runs]
     gain, fit = follows.gain[:, keys], follows.correlation[:, keys]
     clear = np.isfinite(gain) & (gain > 0) & (np.abs(fit) > MIN_FIT)
     logs = np.log(np.where(clear, gain, np.nan))
     informed = np.flatnonzero(clear.any(axis=1)).tolist()
+    measures = np.array([np.isfinite(run.measured[:, keys]).any(axis=0) for run in runs])
     options = changes, adds = options_of(logs, robot)
     own = {i: likeliest(logs[i], options, robot)[0] for i in informed}
     suggested = [changes.index(each) for each in {each for each in own.values() if each}]
@@ -96,41 +102,75 @@ def unit_faults(runs: Sequence[Rows], robot: Robot) -> tuple[Fault, ...]:
             words = (" and ".join(change_in_words(each, robot)[0] for each in rival) for rival in rivals)
             seen += f"; another reading is as good ({' or '.join(words)})"
         fault = fault_of(change, has, ids, seen, robot)
+        if sum(i in own for i in has) < 2:
+            return fault._replace(status=FaultStatus.NOT_CONFIRMED)
         measured = [each for some in (reading, *rivals) for each in some if not each.of_wheels]
         if not rivals or not measured:  # without wheels there is nothing to compare
             return fault
         left_out = f"{KINDS[measured[0].column].logged} is left out; state the units that the logger has"
         sentence = f"{fault.sentence.removesuffix(f'; {fault.repair}')}, so that {left_out}"
-        return Fault(measured[0]._replace(factor=math.nan), fault.run_ids, sentence, left_out)
+        change, others = (
+            measured[0]._replace(factor=math.nan),
+            tuple(each for some in rivals for each in some),
+        )
+        return Fault(change, fault.run_ids, sentence, left_out, FaultStatus.UNDECIDED, others)
+
+    def shown_by(places: Sequence[int]) -> tuple[Changes, list[Changes]]:
+        """Return the reading of some runs with its rivals; none where halves of them differ, or few show it."""
+        best, rivals = likeliest(medians(logs[list(places)]), options, robot)
+        equal = {best, *rivals}
+        for change in best:
+            moves = np.nan_to_num(adds[changes.index((change,))]) != 0.0
+            shows = [i for i in places if (clear[i] & moves).any()]
+            scatter = 1.48 * medians(np.abs(logs[shows] - medians(logs[shows])))[moves]
+            steady = not (np.nan_to_num(scatter) > STEADY).all() or abs(math.log(change.factor)) > GROSS
+            parts = [medians(logs[part]) for part in halves(shows) if part]
+            alike = all({each for each, *_ in [likeliest(part, options, robot)]} <= equal for part in parts)
+            n_measured = int((measures[list(every)] & moves).any(axis=1).sum())
+            if not (steady and alike and len(shows) >= MIN_SHOWN_RATIO * n_measured):
+                return (), []
+        return best, rivals
 
     # those that would show it if they had one of the units that others seem to have
     moved = np.nan_to_num(adds[suggested]).any(axis=0)
     usual = [i for i in informed if not own[i] and (np.isfinite(logs[i]) & moved).any()]
-    if len(usual) < MIN_USUAL_RATIO * len(informed):
-        middle = medians(logs[[i for i in informed if i not in usual]])
-        best, rivals = likeliest(middle, options, robot)
-        has = [i for i in range(len(logs)) if i not in usual]
-        return tuple(fault(best, change, rivals, has) for change in best)
+    faults, left = [], set(range(len(logs)))
+    parts = [
+        range(len(logs)),
+        *([i for i, s in enumerate(sessions) if s == name] for name in dict.fromkeys(sessions)),
+    ]
+    for every in parts:
+        asks = [i for i in informed if i in left and i in set(every) and i not in usual]
+        n_usual = sum(i in set(every) for i in usual)
+        n_own = sum(bool(own[i]) for i in asks)
+        if n_own and n_usual < MIN_USUAL_RATIO * (n_usual + n_own):
+            best, rivals = shown_by(asks)
+            has = [i for i in every if i in left and i not in usual]
+            faults += [fault(best, change, rivals, has) for change in best]
+            left -= set(has) if best else set()
+    if not usual:
+        return tuple(faults)
     middle, scatter = medians(logs[usual]), 1.48 * medians(np.abs(logs[usual] - medians(logs[usual])))
-    near = np.clip(SCATTERS * np.where(np.isfinite(scatter), scatter, TIGHT), TIGHT, NEAR)
+    known = np.isfinite(logs[usual]).sum(axis=0) >= MIN_SCATTER_RUNS  # of fewer no scatter is known
+    near = np.clip(np.where(known, SCATTERS * scatter, NEAR), TIGHT, NEAR)
     of_runs: dict[Changes, list[int]] = {}
     n_changes = np.array([len(each) for each in changes])
-    for i in (i for i in informed if own[i]):
+    for i in (i for i in informed if own[i] and i in left):
         off = np.where(fit[i] > CLEAR_FIT, logs[i], np.nan) - middle
-        left = np.abs(_after(off, adds))
-        agrees = (np.nan_to_num(left) <= near).all(axis=1) & (n_changes > 0) & (np.abs(off) > 2 * NEAR).any()
+        apart = np.abs(_after(off, adds))
+        agrees = (np.nan_to_num(apart) <= near).all(axis=1) & (n_changes > 0) & (np.abs(off) > 2 * NEAR).any()
         small, sound = (off < -2 * NEAR) & _MOVING, (np.abs(off) < near) & _MOVING
         if small.any():  # it may just stall, unless another channel shows that it moved
-            agrees &= (left[:, small] < TIGHT).all(axis=1) & (small.sum() + sound.sum() > 1)
+            agrees &= (apart[:, small] < TIGHT).all(axis=1) & (small.sum() + sound.sum() > 1)
         if agrees.any():
-            distance = np.where(agrees, np.nansum(left, axis=1) + COST * n_changes, np.inf)
+            distance = np.where(agrees, np.nansum(apart, axis=1) + COST * n_changes, np.inf)
             of_runs.setdefault(changes[int(np.argmin(distance))], []).append(i)
-    return tuple(
-        fault(reading, change, (), has)
-        for reading, has in of_runs.items()
-        if len(has) >= MIN_FAULTY_RATIO * len(informed)
-        for change in reading
-    )
+    for reading, some in of_runs.items():
+        votes = np.zeros(len(logs), dtype=int)
+        votes[usual], votes[some] = -1, 1
+        has = faulty_runs(sessions, votes)
+        faults += [fault(reading, change, (), has) for change in reading if has]
+    return tuple(faults)
 
 
 def options_of(logs: Array, robot: Robot) -> Options:
