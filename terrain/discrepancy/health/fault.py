@@ -175,7 +175,7 @@ class Fault(NamedTuple):
         """What was done about it, in words."""
         return {
             FaultStatus.CONFIRMED: "Fault of the logs, repaired before anything was compared",
-            FaultStatus.UNDECIDED: "Fault of the logs, of which it cannot be told which column has it",
+            FaultStatus.UNDECIDED: "Fault of the logs, whose column the other channels cannot determine",
             FaultStatus.NOT_CONFIRMED: "Fault of the logs that no other run confirms, so that nothing was changed",
         }[self.status]
 

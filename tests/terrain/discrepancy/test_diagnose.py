@@ -146,10 +146,10 @@ def test_two_effects_are_named_beside_a_run_that_is_unfit_and_half_of_one_where_
     world = worlds("husky")
     track, payload = world.hidden("effective_track", over=8.0), world.hidden("payload")
     runs = list(world.runs(track | payload))
-    imu = runs[2].streams["imu"]
-    frozen, at = imu.values.copy(), imu.channels.index("gyro_z_radps")
-    frozen[1000:, at] = frozen[1000, at]
-    runs[2] = replace(runs[2], streams={**runs[2].streams, "imu": replace(imu, values=frozen)})
+    wheels = runs[2].streams["wheels"]
+    dead, at = wheels.values.copy(), wheels.channels.index("speed_left_mps")
+    dead[:, at] = 0.0
+    runs[2] = replace(runs[2], streams={**runs[2].streams, "wheels": replace(wheels, values=dead)})
     half = {name: 0.5 * value for name, value in track.items()}
     diagnosis = diagnose(runs, world.simulation.with_effects(half))
     assert [run.run_id for run in diagnosis.excluded_runs] == [runs[2].run_id]
