@@ -430,6 +430,8 @@ def basis_of(robot: Robot, parameter: str, value: float = 0.0) -> tuple[Basis, .
     return tuple(bases)
 
 
+EARLIER = "the description that was extended"  #: Source of what was built in already
+
 DIGITS = 7  #: Significant digits that a file has of each number.
 
 
@@ -438,7 +440,7 @@ def extended_yaml(
     values: Mapping[str, float],
     covariance: Array,
     intervals: Mapping[str, tuple[float, float]],
-    source: str,
+    source: str | Mapping[str, str],
     region: Region | None = None,
     learned: Sequence[LearnedTerm] = (),
 ) -> str:
@@ -451,7 +453,7 @@ def extended_yaml(
     robot_name : or path of its YAML file
     values, covariance : by parameter, and (n, n) in their order
     intervals : 95 % of each value
-    source : of the numbers, in words
+    source : of the numbers, in words; by parameter where they differ
     region : of driving, that they were validated in
     learned : terms that act beside the effects
 
@@ -486,7 +488,8 @@ def extended_yaml(
         low, high = [float(edge) for edge in intervals.get(name, (math.nan, math.nan))]
         if not low <= value <= high < math.inf:
             raise ConfigError(f"effects: {name} is {value:g}, its interval {low:g} to {high:g} must hold it")
-        entry: dict[str, Any] = {"value": _rounded(value), "unit": known[name].unit, "source": source}
+        of = source if isinstance(source, str) else source.get(name, EARLIER)
+        entry: dict[str, Any] = {"value": _rounded(value), "unit": known[name].unit, "source": of}
         section[name] = _flow(entry | {"interval": [_rounded(low), _rounded(high)]})
     lines = ["effects:", *[f"  {name}: {entry}" for name, entry in section.items()]]
     lines.append("  covariance:" if names else "  covariance: {}")

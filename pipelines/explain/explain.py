@@ -52,6 +52,7 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
     """Read runs, explain them as :func:`explain`, and write the page, the extended robot and the next drive."""
     import numpy as np
 
+    from pipelines.explain.statements import sources_of
     from terrain.discrepancy.diagnosed_runs import extended_effects
     from terrain.discrepancy.next_drive import NEXT_FILE, commands_of, next_command
     from terrain.extension import extended_yaml
@@ -85,12 +86,12 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
         ),
         n_pictures=None if settings.pictures == "all" else int(settings.pictures),
         page=out / PAGE_FILE,
-        extended_file=extended_file if found.diagnosis.causes else None,
+        extended_file=extended_file if found.diagnosis.built_in else None,
     )
     if result.extended_file is not None:
-        source = f"terrain explain, {result.diagnosis.n_runs} runs of {settings.dataset or 'a data set'}"
         effects = extended_effects(tested, result.diagnosis)
-        atomic_write(extended_file, extended_yaml(description, *effects, source, result.extended.region))
+        sources = sources_of(result.diagnosis, settings.dataset or "a data set")
+        atomic_write(extended_file, extended_yaml(description, *effects, sources, result.extended.region))
     if (drive := result.diagnosis.next_drive) is None:
         (out / NEXT_FILE).unlink(missing_ok=True)  # of an earlier result
     else:
@@ -122,7 +123,7 @@ def explain(
     Returns
     -------
     ExplainResult
-        with ``report``, ``extended`` (the robot with the named causes built in; as it was where none was named)
+        with ``report``, ``extended`` (the robot with what earned it built in; as it was where nothing did)
         and ``to_pandas()``
 
     Raises
@@ -175,9 +176,13 @@ def explain(
         diagnosed=diagnosed,
         gain=gained,
         extended=extended,
-        statements=statements_of(diagnosis, robot, diagnosed.compared, gained.gain, diagnosed.acting),
-        terms={cause.name: in_robot_terms(cause.name, cause.parameters, robot) for cause in diagnosis.causes},
+        statements=statements_of(diagnosis, robot, diagnosed.compared),
+        terms={
+            cause.name: in_robot_terms(cause.name, cause.parameters, robot) for cause in diagnosis.built_in
+        },
         next_command=next_command(diagnosis.next_drive, description, robot, diagnosed.terrains),
-        notes=notes_of(diagnosis, diagnosed.terrains, terrains_apart(diagnosis, diagnosed.compared)),
+        notes=notes_of(
+            diagnosis, diagnosed.terrains, terrains_apart(diagnosis.differing_channels, diagnosed.compared)
+        ),
         powertrain=powertrain_of(chosen, robot, diagnosis.faults, seed),
     )

@@ -13,7 +13,6 @@ from pipelines.explain.statements import (
     effect_label,
     gain_text,
     in_words_of,
-    reference_text,
     varying_text,
     verdict_text,
     would_have_shown,
@@ -90,15 +89,21 @@ class ExplainResult(Result, eq=False):
             "terrain_matches": runs.terrains,
             "used": [run.run_id for run in runs.used],
             "held_out": [run.run_id for run in runs.held_out],
-            "extended": extended if self.diagnosis.causes else None,
+            "extended": extended if self.diagnosis.built_in else None,
         }
-        return {**super().as_json(), **as_json(beside)}
+        return {**as_json(beside), **super().as_json()}
 
     def records(self) -> Iterable[Any]:
-        """Return the parameters of the named causes."""
+        """Return the parameters of what is built in."""
         return (
-            {"cause": cause.name, **value._asdict(), "held_out_gain": cause.held_out_gain, "z": cause.z}
-            for cause in self.diagnosis.causes
+            {
+                "cause": cause.name,
+                **value._asdict(),
+                "tier": cause.tier,
+                "gain": cause.held_out_gain,
+                "z": cause.z,
+            }
+            for cause in self.diagnosis.built_in
             for value in cause.parameters
         )
 
@@ -106,17 +111,17 @@ class ExplainResult(Result, eq=False):
 def report(result: ExplainResult) -> Report:
     """Return what the simulation gets wrong and the gain, then the causes, then all that they rest on."""
     diagnosis, runs = result.diagnosis, result.diagnosed
-    held_out = f"{len(runs.held_out)} held out for the gain" if runs.held_out else ""
+    held_out = f"{len(runs.held_out)} held out" if runs.held_out else ""
     lead = f"{diagnosis.n_runs} runs compared", held_out, result.data, result.terrain
     picture = None
-    if shown := result.gain.judged or runs.compared:  # held-out runs where there are any
+    if shown := runs.judged or runs.compared:  # held-out runs where there are any
         stretch = example_stretch(shown, runs.noise)
         there = measured_channels([stretch])
         stated = [each.channel for each in result.statements if each.channel in there and each.differs]
         picture = figures.run_figure(stretch, runs.noise, (stated or there)[:PICTURED])
     written = Report(
         title=f"What the simulation of {diagnosis.robot} gets wrong",
-        answer=f"{verdict_text(diagnosis)} {gain_text(result.gain.gain, result.gain.reason)}",
+        answer=f"{verdict_text(diagnosis)} {gain_text(result.gain.gain)}",
         picture=picture,
         parts=[*_decisive_parts(result)],
         details=[section for section in _details(result) if section.parts],
@@ -142,7 +147,7 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
             yield Text(sentence(statement.text))
     causes: list[tuple[Any, ...]] = []
     notes = ["Values are added to what the description has already."]
-    for cause in diagnosis.causes:
+    for cause in diagnosis.built_in:
         label = effect_label(cause.name)
         beside = cause.held_out_gain, cause.z, result.terms.get(cause.name, "")
         for value in cause.parameters:
@@ -154,15 +159,15 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
         if cause.caveat and all(each.name != cause.name for each in diagnosis.varying):
             notes.append(f"{label}: {cause.caveat}.")
     if causes:
-        gain, terms = Column("held-out gain", PERCENT), Column("the robot has", long=True)
+        gain, terms = Column("removes of the square", PERCENT), Column("the robot has", long=True)
         heads = ("cause", "value", "95 %", gain, Column("z", Z), terms)
         yield Table(heads, causes, note=" ".join(notes))
     for names in diagnosis.ambiguous_sets:
         yield _rivals(names, diagnosis)
     for each in diagnosis.varying:
         yield Text(varying_text(each))
-    if result.gain.black_box is not None:
-        yield Text(reference_text(result.gain.black_box))
+    if (before := result.gain.built_in_before) is not None:
+        yield Text(f"Effects that the description has already: {gain_text(before)}")
     if n := len(diagnosis.not_shown):
         of = len(diagnosis.detection_limits)
         yield Text(f"Of {of} parameters that may be wrong, {n} could not have been detected.")
@@ -187,31 +192,27 @@ def _rivals(names: Sequence[str], diagnosis: Diagnosis) -> Table:
     return Table(("one of", "its value, if it acts alone", NEEDS), rows)
 
 
-def _gain_parts(measured: HeldOutGain) -> Iterator[Part]:
-    """Yield by channel what an extension and a black-box reference gain, and what it is for a filter or classifier."""
-    gain, references = measured.gain, {} if measured.black_box is None else measured.black_box.channels
+def _gain_parts(diagnosis: Diagnosis, measured: HeldOutGain) -> Iterator[Part]:
+    """Yield by channel what an extension and a black-box learner gain, and what it is for a filter or classifier."""
     rows: list[tuple[Any, ...]] = []
-    for name in references if gain is None else gain.channels:
-        own, reference = None if gain is None else gain.channels[name], references.get(name)
-        cells: tuple[Any, ...] = (reference and reference.rms_before, *[None] * 3, "")
-        if own is not None:
-            remark = "" if not own.refused else "worse" if own.ci[1] < 0.0 else "no gain to claim"
-            cells = own.rms_before, own.rms_after, own.reduction, own.ci, remark
-        rows.append((*CHANNEL_WORDS[name], *cells, reference and reference.reduction))
-    note = ""
-    if gain is not None:
-        note = (
-            f"Low-pass filtered. Intervals: 95 %, bootstrap over {gain.clusters}. The answer's gain is of all "
-            "channels whitened, with differences from run to run removed. The black-box reference is a Bayesian "
-            "linear regression of the residual on the simulation's inputs, their products and rates, fitted to "
-            f"the runs behind the diagnosis and judged on the same {len(gain.runs)} held-out runs."
-        )
-        if gain.excluded_runs:
-            note += f" Excluded as unfit: {_ids(gain.excluded_runs)}."
+    for of in diagnosis.channels:
+        built = of.gain, of.gain_ci
+        tier = "agrees" if of.tier is None else of.tier.value.replace("_", " ")
+        causes = enumerated([*map(effect_label, of.causes)])
+        rms = of.rms_before, of.rms_after
+        rows.append((*CHANNEL_WORDS[of.channel], tier, causes, *rms, *built, of.learner_gain, of.learner_ci))
+    note = (
+        f"Behind one low-pass, judged on {measured.gain.how}. Intervals: 95 %, over {measured.gain.clusters}. The "
+        "learner is a Bayesian linear regression of the residual on the simulation's inputs, their products and "
+        "rates; it is fitted to the same runs as the causes. The answer's gain is over all channels, each weighed "
+        "by its noise."
+    )
+    if measured.gain.excluded_runs:
+        note += f" Excluded as unfit: {_ids(measured.gain.excluded_runs)}."
     if rows:
-        less, black_box = Column("square less by", PERCENT), Column("by a black-box reference", PERCENT)
-        heads = ("channel", "unit", "rms before", "after", less, Column("95 %", PERCENT), "", black_box)
-        yield Table(heads, rows, note=note)
+        less, interval = Column("square less by", PERCENT), Column("95 %", PERCENT)
+        heads = "channel", "unit", "verdict", "built in", "rms before", "after", less, interval
+        yield Table((*heads, Column("by a learner", PERCENT), interval), rows, note=note)
     for kind, compared in measured.comparisons.items():
         if compared is not None and compared.reason:
             yield Text(f"What it changes for the {kind} {compared.name} is not measured: {compared.reason}.")
@@ -255,7 +256,7 @@ def _details(result: ExplainResult) -> Iterator[Section]:
     diagnosis, runs = result.diagnosis, result.diagnosed
     statements = [tuple(each.text.split(": ", 1)) for each in result.statements]
     yield Section("Channel by channel", [Pairs(statements)])
-    yield Section("Gain on held-out runs, channel by channel", [*_gain_parts(result.gain)])
+    yield Section("Verdict and gain, channel by channel", [*_gain_parts(diagnosis, result.gain)])
     yield Section("Candidates, and what is unexplained", [*_open_parts(diagnosis)])
     if (powertrain := result.powertrain) is not None:
         given = (
@@ -274,7 +275,7 @@ def _details(result: ExplainResult) -> Iterator[Section]:
         )
         yield Section("What to drive next", [Text(why), Text(result.next_command or "", "code")])
     yield Section("What the residuals depend on", [*_dependence_parts(runs)])
-    whole: Sequence[ComparedRun] = [*runs.compared, *result.gain.judged]
+    whole: Sequence[ComparedRun] = [*runs.compared, *(runs.judged if runs.held_out else ())]
     if result.n_pictures is not None:
         whole = telling_runs(whole, runs.noise, result.n_pictures)
     drawn = [figures.run_figure(run, runs.noise, measured_channels([run])) for run in whole]

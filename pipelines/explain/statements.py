@@ -9,12 +9,11 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any, NamedTuple
 
 from pipelines.report.numbers import enumerated
-from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, Slope, off_by, rms_of, slopes_of
-from terrain.discrepancy.held_out import Gain
-from terrain.discrepancy.learner import Reference
+from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, Slope, off_by, slopes_of
+from terrain.discrepancy.gain import Gain
 from terrain.discrepancy.patterns import Kind
 from terrain.discrepancy.robot_terms import UNITS, in_robot_terms, quantity, values_with_intervals
-from terrain.discrepancy.runs import TerrainMatch, measured_channels
+from terrain.discrepancy.runs import TerrainMatch
 from terrain.discrepancy.verdict import Diagnosis, RuledOut, Value, Varying
 from terrain.effects import PARAMETER, TRACKED, effect_named
 from terrain.robots import Robot
@@ -22,14 +21,12 @@ from terrain.robots import Robot
 CHANGED = 0.05
 """Least ratio by which the residual of a channel changes for that to be stated."""
 
-LITTLE_LEFT = 0.05
-"""Part of the square that a black-box reference has to remove beyond the named causes, at the lower end of its
-interval, before something is left to find: less would not change what the simulation is good for."""
-
 MINUS, NBSP = "\N{MINUS SIGN}", "\N{NO-BREAK SPACE}"
 
 SHOWN_RUNS = 5
 """Names of runs that a sentence lists."""
+
+WHERE = "on data held out"
 
 AGREE = "measured and simulated agree"
 
@@ -69,27 +66,18 @@ def statements_of(
     diagnosis: Diagnosis,
     robot: Robot,
     used: Sequence[ComparedRun],
-    gain: Gain | None,
-    acting: Mapping[str, Sequence[str]] | None = None,
 ) -> tuple[Statement, ...]:
-    """Return a sentence a channel, those that state something first.
-
-    Errors are those of the gain on held-out runs where it was measured, else of the runs behind the diagnosis;
-    ``acting`` has by cause the channels that it changes, those where it shows by default.
-    """
-    slopes, extended = slopes_of(used), bool(used) and used[0].after is not None
-    acts = {cause.name: cause.channels for cause in diagnosis.causes} if acting is None else acting
+    """Return a sentence a channel, those that state something first; errors are those on data held out."""
+    slopes = slopes_of(used)
     statements = []
-    for channel in measured_channels(used):
-        slope, where = slopes[channel], "on the runs compared"
-        before, after = rms_of(used, channel, False), rms_of(used, channel, True) if extended else math.nan
-        if gain is not None and channel in gain.channels:
-            before, after, *_ = gain.channels[channel]
-            where = "on held-out runs"
-        causes = tuple(cause.name for cause in diagnosis.causes if channel in acts[cause.name])
-        of = Statement(channel, causes, before, after, "", slope.ratio, slope.level, where)
+    for of_channel in diagnosis.channels:
+        channel, slope = of_channel.channel, slopes.get(of_channel.channel, Slope())
+        errors = of_channel.rms_before, of_channel.rms_after
+        of = Statement(channel, of_channel.causes, *errors, "", slope.ratio, slope.level, WHERE)
         name, unit = CHANNEL_WORDS[channel]
-        text = "; ".join(_clauses(of, diagnosis, robot)) or f"{AGREE} to {before:.2g} {unit} rms {where}"
+        text = (
+            "; ".join(_clauses(of, diagnosis, robot)) or f"{AGREE} to {of.rms_before:.2g} {unit} rms {WHERE}"
+        )
         statements.append(of._replace(text=f"{name}: {text}."))
     return tuple(sorted(statements, key=lambda statement: not statement.differs))
 
@@ -102,7 +90,7 @@ def _clauses(of: Statement, diagnosis: Diagnosis, robot: Robot) -> Iterator[str]
         yield off_by(channel, ratio, level)
     changed, causes = (
         abs(after - before) >= CHANGED * before,
-        {cause.name: cause for cause in diagnosis.causes},
+        {cause.name: cause for cause in diagnosis.built_in},
     )
     # an error that stays is worth stating where a cause shows most
     names = [name for name in of.causes if changed or causes[name].channels[0] == channel]
@@ -198,6 +186,12 @@ def verdict_text(diagnosis: Diagnosis) -> str:
     for names in diagnosis.ambiguous_sets:
         rivals = enumerated([effect_label(name) for name in names], "or")
         sentences.append(f"One of {rivals} is present, and these runs cannot distinguish them.")
+        built = [cause for cause in diagnosis.of_sets if cause.name in names]
+        if built:
+            values = [
+                f"{effect_label(each.name)}, {values_with_intervals(each.parameters)}" for each in built
+            ]
+            sentences.append(f"Built in is what fits best, {enumerated(values)}.")
     if diagnosis.varying:
         sentences += [varying_text(effect) for effect in diagnosis.varying]
     if diagnosis.unexplained:
@@ -209,46 +203,45 @@ def verdict_text(diagnosis: Diagnosis) -> str:
     return " ".join(sentences) or f"These runs show nothing that the simulation of {diagnosis.robot} lacks."
 
 
-def gain_text(gain: Gain | None, reason: str | None) -> str:
-    """Return what an extension gains on held-out runs, or why that was not measured."""
-    if gain is None:
-        return f"The gain on held-out runs was not measured: {reason}."
-    n, percents = len(gain.runs), (f"{100.0 * x:.1f}" for x in (gain.reduction, *gain.ci))
-    runs = f"{n} held-out runs" if n != 1 else "one held-out run"
-    part, least, most = (percent.replace("-", MINUS) for percent in percents)
-    removes = (
-        f"the extension removes {part}{NBSP}% ({least} to {most}{NBSP}%) of the whitened squared residual"
-    )
-    return (
-        f"On {runs} {f'no gain can be claimed: {removes}, which includes zero' if gain.refused else removes}."
-    )
-
-
-def reference_text(reference: Reference) -> str:
-    """Return what a black-box reference reaches beside the named causes.
+def gain_text(gain: Gain) -> str:
+    """Return what an extension gains on data held out, beside the black-box learner.
 
     Examples
     --------
-    >>> reference_text(Reference(5, 0.97, 0.96, {}))
-    'The named causes remove 96 % of the square, a black-box reference 97 %: little is left to find.'
-    >>> reference_text(Reference(5, 0.01, math.nan, {}))
-    'Nothing was named, and a black-box reference removes 1 % of the square: little is left to find.'
+    >>> gain = Gain("8 runs held out", (), (), "runs", {}, 0.81, (0.74, 0.88), False, 0.83, (0.75, 0.91))
+    >>> gain_text(gain)
+    'Judged on 8 runs held out, the extension removes 81 % (74 to 88 %) of the square, a black-box learner 83 %.'
     """
-    named = reference.named_reduction if math.isfinite(reference.named_reduction) else 0.0
-    left, removed = reference.reduction - named, f"{100.0 * max(reference.reduction, 0.0):.0f} %"
-    more = [name for name, of in reference.channels.items() if of.left_to_find_from > LITTLE_LEFT]
-    if more:
-        judged = f"more is left to find in {enumerated([CHANNEL_WORDS[name][0] for name in more])}"
-    elif left > LITTLE_LEFT:
-        judged = f"{reference.n_runs} runs are too few to state more"
-    else:
-        judged = "it finds less than the names state" if left < -LITTLE_LEFT else "little is left to find"
-    if math.isnan(reference.named_reduction):
-        return f"Nothing was named, and a black-box reference removes {removed} of the square: {judged}."
-    return (
-        f"The named causes remove {100.0 * named:.0f} % of the square, a black-box reference "
-        f"{removed}: {judged}."
-    )
+    learner = f"a black-box learner {percent_text(gain.learner_reduction)}"
+    if not math.isfinite(gain.reduction):
+        return f"Judged on {gain.how}, nothing is built in; {learner} of the square."
+    part = f"{percent_text(gain.reduction)} ({percent_text(gain.ci[0], '')} to {percent_text(gain.ci[1])})"
+    refused = ", which may be nothing" if gain.refused else ""
+    return f"Judged on {gain.how}, the extension removes {part} of the square{refused}, {learner}."
+
+
+def sources_of(diagnosis: Diagnosis, data: str) -> dict[str, str]:
+    """Return by parameter that is built in where it comes from: runs, gain, and of which set it is, if of one."""
+    assert diagnosis.gain is not None
+    runs = f"terrain explain, {diagnosis.n_runs} runs of {data}"
+    sources: dict[str, str] = {}
+    for cause in diagnosis.built_in:
+        low, high = cause.gain_ci
+        removes = (
+            f"removes {100 * cause.held_out_gain:.0f} % ({100 * low:.0f} to {100 * high:.0f} %) of the square"
+        )
+        text = f"{runs}; {removes} where it acts, judged on {diagnosis.gain.how}"
+        for names in diagnosis.ambiguous_sets:
+            if cause.name in names:
+                others = [effect_label(name) for name in names if name != cause.name]
+                text += f"; these runs do not distinguish it from {enumerated(others, 'or')}"
+        sources |= {value.name: text for value in cause.parameters}
+    return sources
+
+
+def percent_text(ratio: float, unit: str = f"{NBSP}%") -> str:
+    """Return a part of a square in percent, in full ones."""
+    return f"{100.0 * ratio:.0f}{unit}".replace("-", MINUS)
 
 
 def varying_text(effect: Varying) -> str:

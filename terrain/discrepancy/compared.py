@@ -13,7 +13,6 @@ from scipy.stats import t as student
 
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.runs import INPUTS, LowPass, Signals, Simulation, rows_of
-from terrain.discrepancy.verdict import Diagnosis
 from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
 from terrain.records import Array
 from terrain.signals import true_stretches
@@ -39,6 +38,7 @@ class ComparedRun(NamedTuple):
     after: Array | None  #: (m, channels) with the causes built in; None where none was named
     #: (m,) of the simulation, by the names of :data:`terrain.discrepancy.runs.INPUTS`, and ``time_s``
     inputs: Mapping[str, Array]
+    session: str = ""  #: that the run is part of; empty where that is not known
 
     def part(self, start_s: float, end_s: float) -> ComparedRun:
         """Return the stretch from start to end."""
@@ -74,8 +74,16 @@ def compare_runs(
         inputs = dict(zip(INPUTS, rows.inputs.T, strict=False), time_s=rows.time_s)
         del inputs["wheel_phase_rad"]
         about = rows.run_id, rows.terrain, held_out, rows.time_s, rows.pace_mps
-        compared.append(ComparedRun(*about, rows.measured, rows.predicted, after, inputs))
+        compared.append(ComparedRun(*about, rows.measured, rows.predicted, after, inputs, run.session))
     return tuple(compared)
+
+
+def beside_extended(
+    run: ComparedRun, signals: Signals, extended: Simulation, low_pass: LowPass
+) -> ComparedRun:
+    """Return a run that is compared already beside another extended simulation."""
+    rows = rows_of(signals, extended.planar_on(signals.terrain), extended.vector, (), low_pass)
+    return run._replace(after=rows.predicted)
 
 
 def rms_of(runs: Sequence[ComparedRun], channel: str, extended: bool) -> float:
@@ -327,14 +335,12 @@ def _std_of_mean(off: Array, weight: Array) -> float:
     return float(np.sqrt(((weight * off)[known] ** 2).sum()) / weight[known].sum())
 
 
-def terrains_apart(diagnosis: Diagnosis, used: Sequence[ComparedRun]) -> Mapping[str, Slope]:
+def terrains_apart(channels: Sequence[str], used: Sequence[ComparedRun]) -> Mapping[str, Slope]:
     """Return measured over simulated by terrain where terrains clearly differ; empty where they do not.
 
-    They are compared in the channel of the effect that varies, or of a cause whose caveat is the run; with
-    runs of one label, or runs that are alike, nothing is compared.
+    They are compared in the channels where runs differ; with runs of one label, or runs that are alike, nothing is
+    compared.
     """
-    channels = [effect.channel for effect in diagnosis.varying]
-    channels += [cause.channels[0] for cause in diagnosis.causes if "run" in cause.caveat and cause.channels]
     labels = sorted({run.terrain for run in used if run.terrain})
     if not channels or len(labels) < 2:
         return {}

@@ -12,15 +12,18 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
 from terrain.discrepancy import constancy, verdict
 from terrain.discrepancy.clocks import latencies_of, shifts_of
+from terrain.discrepancy.earned import MIN_RUNS, HeldOut, Judgement, crossed_runs, judge
 from terrain.discrepancy.evidence import EXCITED_RATIO, Z_EFFECT, Evidence, move_point, partial_information
-from terrain.discrepancy.health.fault import repaired
+from terrain.discrepancy.gain import THIRDS
+from terrain.discrepancy.health.fault import Fault, repaired
 from terrain.discrepancy.health.faults import faults_of
-from terrain.discrepancy.health.unfit import clocks_of, unfit_runs
+from terrain.discrepancy.health.unfit import Clock, clocks_of, unfit_runs
 from terrain.discrepancy.next_drive import MOST, next_drive
 from terrain.discrepancy.probes import TILT_INPUTS, ProbeResult, probe_residuals
 from terrain.discrepancy.robot_terms import UNITS
@@ -40,8 +43,6 @@ from terrain.effects import BOUNDS, CHANNELS, Effect, effect_named
 from terrain.errors import DataError
 from terrain.records import Array, RunLog
 
-MIN_RUNS = 3  #: Least number of runs: with fewer none is left to validate a fit
-
 BLIND_RATIO = 0.05
 """Ratio of the parameters that may not be shown before a diagnosis without findings is ``not_shown``."""
 
@@ -55,9 +56,64 @@ MAX_WITHDRAWN = 6  #: Most causes that are withdrawn one after the other
 ENTANGLED = 0.97
 """Correlation of fitted values above which two causes are ambiguous: a collinearity index of 6."""
 
+LITTLE_LEFT = 0.05
+"""Part of the square of a channel that the black-box learner has to remove, at the lower end of its interval, before
+something is unexplained: less would not change what the simulation is good for."""
+
 POWER_Z = 1.28  #: Added to the threshold, so that nine in ten are detected
 
 REST_MPS = 0.02  #: Fastest that a wheel turns, by its sensor's noise, in a run that does not drive
+
+
+class Found(NamedTuple):
+    """What was found in runs, before it is judged."""
+
+    problem: Problem
+    start: Evidence  #: of the simulation as it is given
+    fit: CauseFit
+    withdrawn: Mapping[str, verdict.Cause]  #: candidates, by name
+    varying: tuple[verdict.Varying, ...]
+    excluded: tuple[Excluded, ...]
+    faults: tuple[Fault, ...]
+    clocks: tuple[Clock, ...]
+
+    @property
+    def noise(self) -> dict[str, float]:
+        """Standard deviation of the noise by channel that was measured."""
+        measured = measured_channels(self.start.rows)
+        return {name: float(self.start.noise.std[CHANNELS.index(name)]) for name in measured}
+
+    @property
+    def answers(self) -> tuple[list[Effect], list[tuple[str, ...]]]:
+        """The effects that may be named, and sets of which one is present, the one that is fitted first."""
+        fit = self.fit
+        members = {cause.name: (cause.name, *fit.rivals[cause.name]) for cause in fit.causes}
+        significant = [cause for cause in fit.causes if fit.tests[cause.name].significant]
+        named = [cause for cause in significant if not fit.rivals[cause.name]]
+        sets = [members[cause.name] for cause in significant if fit.rivals[cause.name]]
+        std = np.sqrt(np.diag(fit.cov))
+        for one, other in combinations(fit.causes, 2):
+            i, j = fit.at(one), fit.at(other)
+            entangled = np.abs(fit.cov[np.ix_(i, j)]) > ENTANGLED * np.outer(std[i], std[j])
+            if (one in named or other in named) and entangled.any():
+                sets = [names for names in sets if names[0] not in (one.name, other.name)]
+                sets.append(tuple(dict.fromkeys((*members[one.name], *members[other.name]))))
+                named = [cause for cause in named if cause not in (one, other)]
+        return named, sets
+
+    @property
+    def built_in(self) -> list[Effect]:
+        """The effects that extend the simulation: those named, and of each set those that are fitted."""
+        named, sets = self.answers
+        of_sets = {name for names in sets for name in names}
+        return [cause for cause in self.fit.causes if cause in named or cause.name in of_sets]
+
+    @property
+    def extended(self) -> Simulation:
+        """The simulation with these built in."""
+        fit = self.fit
+        names = names_of(self.built_in)
+        return self.problem.simulation.with_effects({n: float(fit.change[fit.names.index(n)]) for n in names})
 
 
 def diagnose(
@@ -65,8 +121,25 @@ def diagnose(
     simulation: Simulation,
     library: Sequence[Effect] | None = None,
     signals: Sequence[Signals] | None = None,
+    seed: int = 0,
 ) -> verdict.Diagnosis:
-    """Return what a simulation gets wrong about measured runs.
+    """Return what a simulation gets wrong about measured runs, judged by leaving parts of them out in turn.
+
+    Takes and raises what :func:`find_causes` does; the ``seed`` is of the parts and of the bootstrap.
+    """
+    found = find_causes(runs, simulation, library, signals)
+    problem = found.problem
+    on = crossed_runs(problem.signals, problem.simulation, problem.low_pass, found.noise, seed)
+    return statement_of(*judged(found, on))
+
+
+def find_causes(
+    runs: Sequence[RunLog],
+    simulation: Simulation,
+    library: Sequence[Effect] | None = None,
+    signals: Sequence[Signals] | None = None,
+) -> Found:
+    """Return what reduces the residual of measured runs, and what speaks against it.
 
     Parameters
     ----------
@@ -81,9 +154,7 @@ def diagnose(
         if runs are of another robot, too few, of one id, or too short, or have no channel in common with the
         simulation, if too few are consistent with each other, or if their clocks are further apart than is searched.
     """
-    ids = Counter([run.run_id for run in runs])
-    if twice := [run_id for run_id, n in ids.items() if n > 1]:
-        raise DataError(f"runs: {twice[0]!r} is the id of {ids[twice[0]]} runs; each needs its own")
+    check_ids(runs)
     if len(runs) < MIN_RUNS:
         raise DataError(f"runs: there are {len(runs)}, at least {MIN_RUNS} are required, to hold some out")
     signals = [signals_of(run, simulation.robot) for run in runs] if signals is None else signals
@@ -145,6 +216,37 @@ def diagnose(
     unlike = [run.run_id for run in excluded if run.reason.startswith(UNLIKE)][:MAX_UNLIKE]
     named_in = {run_id: constancy.unlike_in(problem, fit, by_id[run_id]) for run_id in unlike}
     excluded = tuple([named_in.get(run.run_id) or run for run in excluded])
+    return Found(problem, start, fit, withdrawn, varying, excluded, faults, clocks_of(aligned, shift))
+
+
+def check_ids(runs: Sequence[RunLog]) -> None:
+    """Raise a DataError where two runs have one id."""
+    ids = Counter([run.run_id for run in runs])
+    if twice := [run_id for run_id, n in ids.items() if n > 1]:
+        raise DataError(f"runs: {twice[0]!r} is the id of {ids[twice[0]]} runs; each needs its own")
+
+
+def judged(found: Found, on: HeldOut) -> tuple[Found, Judgement]:
+    """Return what was found without what did not earn its name on data held out, and how the rest was judged.
+
+    One is withdrawn at a time, the one that removes least, and the others are fitted anew.
+    """
+    while True:
+        judgement = judge(found.fit, found.built_in, on)
+        if not judgement.reasons:
+            return found, judgement
+        doubtful = [cause for cause in found.fit.causes if cause.name in judgement.reasons]
+        worst = min(doubtful, key=lambda cause: judgement.removed[cause.name][0])
+        problem, withdrawn = found.problem, dict(found.withdrawn)
+        fit = _withdraw(problem, found.fit, worst, judgement.reasons[worst.name], withdrawn)
+        fit = pooled(problem, fit._replace(rivals=rivals_of(problem, fit.info, found.start, fit.causes)))
+        found = found._replace(fit=fit, withdrawn=withdrawn)
+
+
+def statement_of(found: Found, judgement: Judgement) -> verdict.Diagnosis:
+    """Return what is stated of what was found."""
+    problem, start, fit, withdrawn, varying, excluded, faults, clocks = found
+    effects, varies = problem.library, {name for own in varying for name in (own.name, *own.rivals)}
 
     # channels that depend on an input, the most significant of each, or on a cause that was withdrawn
     best: dict[str, verdict.Unexplained] = {}
@@ -164,29 +266,22 @@ def diagnose(
             best[channel] = verdict.Unexplained(channel, out.name, out.z, 0.0)
     unexplained = tuple(sorted(best.values(), key=lambda left: -left.z))
 
-    # what is named, and sets of which one is present
-    members = {cause.name: (cause.name, *fit.rivals[cause.name]) for cause in fit.causes}
-    significant = [cause for cause in fit.causes if fit.tests[cause.name].significant]
-    named = [cause for cause in significant if not fit.rivals[cause.name]]
-    sets = [members[cause.name] for cause in significant if fit.rivals[cause.name]]
-    std = np.sqrt(np.diag(fit.cov))
-    for one, other in combinations(fit.causes, 2):
-        i, j = fit.at(one), fit.at(other)
-        entangled = np.abs(fit.cov[np.ix_(i, j)]) > ENTANGLED * np.outer(std[i], std[j])
-        if (one in named or other in named) and entangled.any():
-            sets = [names for names in sets if names[0] not in (one.name, other.name)]
-            sets.append(tuple(dict.fromkeys((*members[one.name], *members[other.name]))))
-            named = [cause for cause in named if cause not in (one, other)]
+    named, sets = found.answers
+    built = found.built_in
     values = {cause.name: values_of(fit, cause) for cause in fit.causes}
     for rivals in fit.rivals.values():
         for name, (change, error) in rivals.items():
             values.setdefault(name, _values(effect_named(name), change, error))
-    parameters = names_of(named)
+    parameters = names_of(built)
     at = [fit.names.index(name) for name in parameters]
-    inflation = np.array([fit.tests[effect.name].inflation for effect in named for _ in effect.parameters])
+    inflation = np.array([fit.tests[effect.name].inflation for effect in built for _ in effect.parameters])
     cov = fit.cov[np.ix_(at, at)] * np.sqrt(np.outer(inflation, inflation))
 
-    causes = [cause_of(problem, fit, effect) for effect in named]
+    stated = []
+    for effect in built:
+        removed, interval = judgement.removed[effect.name]
+        cause = cause_of(problem, fit, effect)._replace(held_out_gain=removed, gain_ci=interval)
+        stated.append(cause._replace(tier=Tier.NAMED if effect in named else Tier.SET))
 
     # what could not have been detected beside it, and what is not the answer
     limits, a = [], fit.info.a.sum(axis=0)
@@ -222,19 +317,43 @@ def diagnose(
             candidates.append(cause_of(problem, fit, effect, reason))
         else:
             ruled_out.append(verdict.RuledOut(effect.name, reason, test.z))
+    candidates.sort(key=lambda cause: -cause.z)
+    causes = tuple(cause for cause in stated if cause.tier is Tier.NAMED)
+    of_sets = tuple(cause for cause in stated if cause.tier is Tier.SET)
+    missing = {limit.name for limit in missed}
+    channels, shows = (
+        [],
+        judgement.gain.clusters != THIRDS,
+    )  # what one run has in common in itself is no cause
+    for name, of in judgement.gain.channels.items():
+        acting = [cause for cause in stated if name in judgement.acting[cause.name]]
+        hidden = [p for effect in effects if name in effect.channels[:1] for p in effect.parameters]
+        tiers = {
+            Tier.NAMED: judgement.earned(of) and any(cause in causes for cause in acting),
+            Tier.SET: judgement.earned(of) and any(cause in of_sets for cause in acting),
+            Tier.CANDIDATE: any(name in cause.channels for cause in candidates)
+            or any(own.channel == name for own in varying),
+            Tier.UNEXPLAINED: any(left.channel == name for left in unexplained)
+            or (shows and (of.left_ci if stated else of.learner_ci)[0] > LITTLE_LEFT),
+            Tier.NOT_SHOWN: sum(p.name in missing for p in hidden) > BLIND_RATIO * len(hidden),
+        }
+        tier = next((tier for tier, holds in tiers.items() if holds), None)
+        names = tuple(cause.name for cause in acting)
+        channels.append(verdict.ChannelVerdict(name, tier, names, *of))
+    whole = judgement.earned(judgement.gain)
     tiers = {
-        Tier.NAMED: named,
-        Tier.SET: sets,
-        Tier.CANDIDATE: candidates or varying,
-        Tier.UNEXPLAINED: unexplained,
+        Tier.NAMED: bool(causes) and whole,
+        Tier.SET: bool(of_sets) and whole,
+        Tier.CANDIDATE: bool(candidates or varying) and not stated,
+        Tier.UNEXPLAINED: bool(stated or unexplained) or any(c.tier is Tier.UNEXPLAINED for c in channels),
         Tier.NOT_SHOWN: len(missed) > BLIND_RATIO * len(limits),
     }
-    built_in = problem.simulation.with_effects(dict(zip(parameters, fit.change[at].tolist(), strict=True)))
-    after = problem.at(built_in.vector, (), noise=fit.info.noise, scatter=fit.info.scatter)
+    after = problem.at(found.extended.vector, (), noise=fit.info.noise, scatter=fit.info.scatter)
     return verdict.Diagnosis(
-        robot=simulation.robot.name,
+        robot=problem.simulation.robot.name,
         verdict=next((tier for tier, holds in tiers.items() if holds), None),
-        causes=tuple(causes),
+        causes=causes,
+        of_sets=of_sets,
         covariance=verdict.Covariance(parameters, cov),
         ambiguous_sets=tuple(sets),
         ambiguous_values={name: values[name] for names in sets for name in names},
@@ -243,15 +362,17 @@ def diagnose(
         not_shown=tuple(missed),
         ruled_out=tuple(ruled_out),
         excluded_runs=excluded,
-        clocks=clocks_of(aligned, shift),
-        next_drive=next_drive(simulation, sets, missed, fit.info),
+        clocks=clocks,
+        next_drive=next_drive(problem.simulation, sets, missed, fit.info),
         residual_before=residuals_of(start, start),
         residual_after=residuals_of(after, start),
         n_runs=len(problem.signals),
         varying=varying,
         faults=faults,
-        by_session=constancy.values_by_session(fit, problem.signals, named, simulation.robot),
-        candidates=tuple(sorted(candidates, key=lambda cause: -cause.z)),
+        by_session=constancy.values_by_session(fit, problem.signals, built, problem.simulation.robot),
+        candidates=tuple(candidates),
+        channels=tuple(channels),
+        gain=judgement.gain,
     )
 
 
@@ -448,7 +569,7 @@ def channel_effects(fit: CauseFit, cause: Effect) -> dict[str, tuple[float, floa
 
 def cause_of(problem: Problem, fit: CauseFit, effect: Effect, reason: str = "") -> verdict.Cause:
     """Return a cause, named or, where a reason speaks against that, a candidate; one not fitted by its linear fit."""
-    test, size, caveats = fit.tests[effect.name], float(fit.info.c.sum()), []
+    test, caveats = fit.tests[effect.name], []
     if effect in fit.causes:
         values, parameter = values_of(fit, effect), effect.parameters[0]
         caveat = constancy_of_cause(fit, effect).caveat
@@ -462,13 +583,12 @@ def cause_of(problem: Problem, fit: CauseFit, effect: Effect, reason: str = "") 
         own, base = _own_and_base(fit, effect)
         free = partial_information(fit.info.a.sum(axis=0), base, own)[1]
         values = _values(effect, test.change, np.sqrt(np.diag(np.linalg.pinv(free)) * test.inflation))
-    low, high = test.gain_interval
     return verdict.Cause(
         name=effect.name,
         aliases=effect.aliases,
         parameters=values,
-        held_out_gain=float(test.gain.sum()) / size,
-        gain_ci=(low / size, high / size),
+        held_out_gain=math.nan,
+        gain_ci=(math.nan, math.nan),
         channels=shown_channels(fit, effect),
         z=test.z,
         dispersion=test.dispersion,

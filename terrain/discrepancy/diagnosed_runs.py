@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,41 +12,26 @@ import numpy as np
 
 from terrain.discrepancy.compared import ComparedRun, compare_runs, without_levels
 from terrain.discrepancy.constancy import PartValues, part_values
-from terrain.discrepancy.diagnose import diagnose
+from terrain.discrepancy.diagnose import check_ids, find_causes, judged, statement_of
+from terrain.discrepancy.earned import MIN_RUNS, crossed_runs, held_out_runs
+from terrain.discrepancy.gain import Gain
 from terrain.discrepancy.grounds import simulation_for
-from terrain.discrepancy.health.fault import repaired
-from terrain.discrepancy.held_out import (
-    HOLD_OUT_FROM,
-    Comparison,
-    Gain,
-    filter_gain,
-    fit_to_judge,
-    gain_of_signals,
-    repair_held_out,
-    split_runs,
-)
-from terrain.discrepancy.learner import Reference, black_box_reference
+from terrain.discrepancy.held_out import Comparison, filter_gain, repair_held_out, split_runs
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.runs import (
     LowPass,
     Signals,
     Simulation,
     TerrainMatch,
+    comparable,
     in_order,
-    low_pass_of,
-    signals_of,
 )
-from terrain.discrepancy.search import Problem
 from terrain.discrepancy.verdict import INTERVAL_T, Diagnosis
-from terrain.effects import CHANNELS, Effect
+from terrain.effects import Effect
 from terrain.errors import ConfigError, DataError
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
-
-ACTS_RATIO = 0.25
-"""Least part of the change of a channel by all causes, root mean square, that one of them makes to be named
-with it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,41 +40,42 @@ class DiagnosedRuns:
 
     diagnosis: Diagnosis
     simulation: Simulation
-    extended: Simulation | None  #: with the causes built in; None where no cause was named
+    extended: Simulation | None  #: with what was named built in; None where nothing was
     terrains: tuple[TerrainMatch, ...]  #: on which the runs of each label were simulated
+    signals: tuple[Signals, ...]  #: of the runs that are compared, faults repaired
     fit: tuple[RunLog, ...]  #: behind the diagnosis
     used: tuple[RunLog, ...]  #: these and those excluded from it
     held_out: tuple[RunLog, ...]
     compared: tuple[ComparedRun, ...]  #: fit runs beside the simulation
-    held_signals: tuple[Signals, ...]  #: of the runs held out, faults repaired
+    judged: tuple[ComparedRun, ...]  #: runs held out, or left out in turn, beside the simulation
     noise: Noise  #: of the fit runs
     low_pass: LowPass
     parts: tuple[PartValues, ...]  #: values of the causes in parts of the data
-    acting: Mapping[str, Sequence[str]]  #: by cause, the channels that it changes
+    acting: Mapping[str, Sequence[str]]  #: by cause, the channels where it acts, on the runs judged
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOutGain:
-    """What an extension gains on held-out runs; None, and why, where it was not measured."""
+    """What an extension gains on data held out; of what was built in before it, on all runs."""
 
-    gain: Gain | None
-    reason: str | None = None
+    gain: Gain
+    built_in_before: Gain | None = None
+    """What the effects that the description had already gain over one without, on all runs; None without any."""
     comparisons: Mapping[str, Comparison | None] = field(default_factory=dict)
     """By ``filter`` and ``classifier``; None for one that does not apply."""
-    black_box: Reference | None = None  #: what a black-box reference reaches; None where no run is held out
-    judged: tuple[ComparedRun, ...] = ()  #: held-out runs that are fit, beside the simulation
 
     def as_json(self) -> dict[str, Any]:
         """Return the gain as JSON has it."""
-        measured = {"reason": self.reason} if self.gain is None else self.gain._asdict()
-        reference = {} if self.black_box is None else {"black_box_reference": self.black_box}
-        return {"measured": self.gain is not None, **measured, **self.comparisons, **reference}
+        return {**self.gain._asdict(), "built_in_before": self.built_in_before, **self.comparisons}
 
 
 def diagnose_runs(
     runs: Sequence[RunLog], robot: Robot, library: Sequence[Effect], hold_out: int | None, seed: int
 ) -> DiagnosedRuns:
-    """Return the diagnosis of all runs but those held out (chosen by the seed), and the simulation extended by it.
+    """Return the diagnosis of all runs but those held out (chosen by the seed), judged on these.
+
+    Where none is held out, parts of the runs are left out of the fit in turn.  Runs that cannot be compared are
+    excluded, with the reason.
 
     Raises
     ------
@@ -96,91 +83,83 @@ def diagnose_runs(
         if runs are too few, or cannot be compared with the simulation.
     """
     runs = [with_wheel_speeds(run, robot) for run in in_order(runs)]
+    check_ids(runs)
+    every, left_out = comparable(runs, robot)
     place = {run.run_id: float(k) for k, run in enumerate(runs)}
-    used, held_out = split_runs(runs, hold_out, seed)
-    every = {run.run_id: replace(signals_of(run, robot), place=place[run.run_id]) for run in used}
-    simulation, terrains = simulation_for(used, robot, library, [*every.values()])
-    diagnosis = diagnose(used, simulation, library, [*every.values()] if len(every) == len(used) else None)
-    # ambiguous sets are left out: which of their effects acts is not known
-    extended = simulation.with_effects(diagnosis.values) if diagnosis.causes else None
-    excluded = {run.run_id for run in diagnosis.excluded_runs}
-    fit = tuple(run for run in used if run.run_id not in excluded)
-    signals = repaired([every[run.run_id] for run in fit], diagnosis.faults)
-    low_pass = low_pass_of(signals)
-    compared = compare_runs(simulation, extended, signals, low_pass)
-    last = extended or simulation
-    info = Problem(signals, simulation, low_pass, tuple(library)).at(last.vector)
-    held_signals = [signals_of(run, robot) for run in held_out]
+    by_id = {run.run_id: replace(run, place=place[run.run_id]) for run in every}
+    if left_out and len(by_id) < MIN_RUNS:
+        why = "; ".join([f"{run.run_id}: {run.reason}" for run in left_out[:3]])
+        raise DataError(f"runs: only {len(by_id)} of {len(runs)} can be compared ({why})")
+    used, held_out = split_runs([run for run in runs if run.run_id in by_id], hold_out, seed)
+    given = [by_id[run.run_id] for run in used]
+    simulation, terrains = simulation_for(used, robot, library, given)
+    found = find_causes(used, simulation, library, given)
+    problem = found.problem
+    about = simulation, problem.low_pass, found.noise, seed
+    on = None
+    if held_out:
+        given = [by_id[run.run_id] for run in held_out]
+        held = repair_held_out(given, found.faults, found.extended, problem.low_pass, found.noise)
+        plain = compare_runs(simulation, None, problem.signals, problem.low_pass)
+        with suppress(DataError):  # none of them is fit to judge on
+            on = held_out_runs(plain, held, found.extended, *about)
+    on = on or crossed_runs(problem.signals, *about)
+    found, judgement = judged(found._replace(excluded=(*left_out, *found.excluded)), on)
+    diagnosis = statement_of(found, judgement)
+    extended = found.extended if diagnosis.built_in else None
+    compared = compare_runs(simulation, extended, problem.signals, problem.low_pass)
+    info = problem.at((extended or simulation).vector)
+    behind = {run.run_id for run in problem.signals}
     return DiagnosedRuns(
         diagnosis=diagnosis,
         simulation=simulation,
         extended=extended,
         terrains=terrains,
-        fit=fit,
+        signals=problem.signals if on.in_turn else (*problem.signals, *on.signals),
+        fit=tuple(run for run in used if run.run_id in behind),
         used=tuple(used),
         held_out=tuple(held_out),
         compared=compared,
-        held_signals=repair_held_out(held_signals, diagnosis.faults, last, low_pass, _noise_of(diagnosis)),
+        judged=judgement.runs,
         noise=without_levels(info.noise, compared),
-        low_pass=low_pass,
-        parts=part_values(info, diagnosis.causes),
-        acting=acting_causes(simulation, diagnosis, signals, compared),
+        low_pass=problem.low_pass,
+        parts=part_values(info, diagnosis.built_in),
+        acting=judgement.acting,
     )
 
 
-def _noise_of(diagnosis: Diagnosis) -> dict[str, float]:
-    return {channel: residual.noise for channel, residual in diagnosis.residual_before.items()}
-
-
-def acting_causes(
-    simulation: Simulation, diagnosis: Diagnosis, signals: Sequence[Signals], used: Sequence[ComparedRun]
-) -> dict[str, tuple[str, ...]]:
-    """Return the channels that each named cause changes: where the extension without it predicts otherwise."""
-    acting, low_pass = {}, low_pass_of(signals)
-
-    def squares(others: Sequence[ComparedRun], extended: bool) -> Array:
-        """Return the square (channels,) of differences from the extended simulation, where it was measured."""
-        apart = (
-            run.residual(True) - other.residual(extended) for run, other in zip(used, others, strict=True)
-        )
-        return np.asarray(sum((np.nansum(x**2, axis=0) for x in apart), np.zeros(len(CHANNELS))))
-
-    for cause in diagnosis.causes:
-        own = {value.name for value in cause.parameters}
-        others = {name: value for name, value in diagnosis.values.items() if name not in own}
-        without = compare_runs(simulation, simulation.with_effects(others), signals, low_pass)
-        acts = squares(without, True) > ACTS_RATIO**2 * squares(used, False)
-        acting[cause.name] = tuple(name for name, yes in zip(CHANNELS, acts, strict=True) if yes)
-    return acting
-
-
 def held_out_gain(diagnosed: DiagnosedRuns, robot: Robot, seed: int) -> HeldOutGain:
-    """Return what the extension gains on the runs held out, or why that was not measured."""
-    simulation, extended, runs = diagnosed.simulation, diagnosed.extended, diagnosed.held_signals
-    gain, reason = None, None
-    comparisons: dict[str, Comparison | None] = {}
-    fit: Sequence[Signals] = ()
-    try:
-        if not runs:
-            reason = (
-                f"no run was held out ({len(diagnosed.used)} runs; {HOLD_OUT_FROM} or more, or --hold-out, "
-                "hold some out)"
-            )
-        elif extended is None:
-            reason = "no cause was named, so that nothing was built in"
-            fit = fit_to_judge(simulation, runs)[0]
-        else:
-            gain = gain_of_signals(simulation, extended, runs, seed)
-            fit = [run for run in runs if run.run_id in gain.runs]
-    except DataError as error:
-        reason = reason or str(error)
-    if extended is not None and runs:
+    """Return what the extension gains, for a filter too, and what the effects gain that the robot had already."""
+    diagnosis, comparisons = diagnosed.diagnosis, {}
+    if diagnosed.extended is not None and diagnosed.held_out:
         # a filter is given the logs as they are: with a fault in them its error is that of the fault
-        faulty = bool(diagnosed.diagnosis.faults)
-        comparisons["filter"] = None if faulty else filter_gain(diagnosed.held_out, robot, extended, seed)
-    judged = compare_runs(simulation, extended, fit, diagnosed.low_pass, held_out=True)
-    reference = black_box_reference(diagnosed.compared, judged, _noise_of(diagnosed.diagnosis), seed)
-    return HeldOutGain(gain, reason, comparisons, reference, judged)
+        extended = diagnosed.extended
+        comparisons["filter"] = (
+            None if diagnosis.faults else filter_gain(diagnosed.held_out, robot, extended, seed)
+        )
+    assert diagnosis.gain is not None
+    return HeldOutGain(diagnosis.gain, gain_built_in(diagnosed, seed), comparisons)
+
+
+def gain_built_in(diagnosed: DiagnosedRuns, seed: int) -> Gain | None:
+    """Return what the effects that a simulation has already gain on all runs, over the same without; None without.
+
+    None of the runs was used to find them, as far as is known.
+    """
+    simulation = diagnosed.simulation
+    if not simulation.effects:
+        return None
+    bare = replace(simulation, effects={})
+    signals, low_pass = diagnosed.signals, diagnosed.low_pass
+    on = crossed_runs(
+        signals,
+        bare,
+        low_pass,
+        {name: of.noise for name, of in diagnosed.diagnosis.residual_before.items()},
+        seed,
+    )
+    runs = on.beside([simulation.effects] * len(on.left_out))
+    return on._replace(how=f"{len(runs)} runs, none of which was used to find it").gain(runs)
 
 
 # -- The simulation, and the description of the robot, with what it lacked built in ------------------------

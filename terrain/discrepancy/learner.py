@@ -25,8 +25,6 @@ import numpy as np
 from scipy.stats import t as student
 
 from terrain.discrepancy.compared import ComparedRun
-from terrain.discrepancy.evidence import MIN_CLUSTERS
-from terrain.discrepancy.held_out import ratio_of_sums
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.runs import (
     LowPass,
@@ -60,82 +58,33 @@ sensor may be the late one."""
 LEAST_RANGE = 1e-6  #: Spread of a column that counts as constant
 
 
-class ChannelReference(NamedTuple):
-    """Residual of one channel on the runs held out, and behind the reference, in the channel's unit."""
+def predicted_residuals(used: Sequence[ComparedRun], judged: Sequence[ComparedRun]) -> list[Array]:
+    """Return what a learner fitted to the runs used predicts of measured minus simulated (m, channels) of others.
 
-    rms_before: float
-    rms_after: float
-    reduction: float  #: part of the square that the reference removes; below 0 where it adds to it
-    named_reduction: float  #: part that the named causes remove; NaN where none was named
-    left_to_find_from: float
-    """Lower end of the 95 % interval, by bootstrap over runs, of what the reference removes beyond the named
-    causes; NaN where runs are too few: what one run has in common in itself is no cause."""
-
-
-class Reference(NamedTuple):
-    """What a black-box reference reaches, beside the named causes."""
-
-    n_runs: int  #: held out, on which it is judged
-    reduction: float  #: of the squares of all channels, each over its noise
-    named_reduction: float
-    channels: Mapping[str, ChannelReference]
-
-
-def black_box_reference(
-    used: Sequence[ComparedRun], held_out: Sequence[ComparedRun], noise: Mapping[str, float], seed: int = 0
-) -> Reference | None:
-    """Return what a black-box reference, fitted to the runs used, reaches on runs held out; None without any.
-
-    Squares of channels are added over the ``noise`` of each.
+    Channels that no run used measured are NaN.
     """
-    if not used or not held_out:
-        return None
     from sklearn.linear_model import BayesianRidge
 
-    columns, test = [np.concatenate([_regressors(run) for run in runs]) for runs in (used, held_out)]
-    n_rows = np.array([len(run.time_s) for run in held_out])
-    channels, total = {}, np.zeros(3)
+    predicted = [np.full((len(run.time_s), len(CHANNELS)), np.nan) for run in judged]
+    if not used or not judged:
+        return predicted
+    columns, test = [np.concatenate([_regressors(run) for run in runs]) for runs in (used, judged)]
+    ends = np.cumsum([len(run.time_s) for run in judged])[:-1]
     for name in measured_channels(used):
         c = CHANNELS.index(name)
-        before = np.concatenate([run.residual(False)[:, c] for run in held_out])
         target = np.concatenate([run.residual(False)[:, c] for run in used])
-        judged = np.isfinite(before)
-        if not judged.any():
-            continue
-        # a constant where nothing varies
         known = np.isfinite(target) & np.isfinite(columns).all(axis=1)
-        left = np.array([before[judged]] * 3)  # before, behind the reference, and with the named causes
+        if not known.any():
+            continue
         mean, spread = columns[known].mean(axis=0), columns[known].std(axis=0)
         use = spread > LEAST_RANGE
+        values = np.full(len(test), float(target[known].mean()))  # a constant where nothing varies
         if use.any() and target[known].std() > 0.0:
-            x, there = [(rows[:, use] - mean[use]) / spread[use] for rows in (columns[known], test[judged])]
-            left[1] -= BayesianRidge().fit(x, target[known]).predict(np.nan_to_num(there))
-        elif known.any():
-            left[1] -= float(target[known].mean())
-        if held_out[0].after is not None:
-            left[2] = np.concatenate([run.residual(True)[:, c] for run in held_out])[judged]
-        square = np.zeros((3, judged.size))
-        square[:, judged] = left**2
-        by_run = np.add.reduceat(square, np.cumsum(n_rows) - n_rows, axis=1)
-        by_run = by_run[:, np.add.reduceat(judged, np.cumsum(n_rows) - n_rows) > 0]
-        low = math.nan
-        if by_run.shape[1] >= MIN_CLUSTERS:
-            low = ratio_of_sums(by_run[2] - by_run[1], by_run[0], seed)[1][0]
-        squares = square.sum(axis=1)
-        if held_out[0].after is None:
-            squares[2] = math.nan
-        rms = np.sqrt(squares / judged.sum()).tolist()
-        channels[name] = ChannelReference(rms[0], rms[1], *_removed(squares), low)
-        if noise.get(name, math.nan) > 0:
-            total += squares / noise[name] ** 2
-    return Reference(len(held_out), *_removed(total), channels)
-
-
-def _removed(squares: Array) -> tuple[float, float]:
-    """Return the parts of the first square that are removed in the second and in the third."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        first, second = (1.0 - squares[1:] / squares[0]).tolist()
-    return first, second
+            x, there = [(rows[:, use] - mean[use]) / spread[use] for rows in (columns[known], test)]
+            values = BayesianRidge().fit(x, target[known]).predict(np.nan_to_num(there))
+        for run, own in zip(predicted, np.split(values, ends), strict=True):
+            run[:, c] = own
+    return predicted
 
 
 def _regressors(run: ComparedRun) -> Array:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
 
+from terrain.discrepancy.gain import Gain
 from terrain.discrepancy.health.fault import Fault
 from terrain.discrepancy.health.unfit import Clock
 from terrain.discrepancy.patterns import Kind
@@ -68,14 +69,14 @@ class Cause(NamedTuple):
     name: str
     aliases: tuple[str, ...]
     parameters: tuple[Value, ...]  #: values, over what the simulation has of them already
-    #: ratio of the whitened squared residual that it removes from runs left out of its fit
+    #: part of the square that it removes on data held out beside the others, where it acts; NaN of a candidate
     held_out_gain: float
-    gain_ci: tuple[float, float]  #: its 95 % interval by bootstrap over runs
+    gain_ci: tuple[float, float]  #: its 95 % interval
     channels: tuple[str, ...]  #: where it shows, the clearest first
     z: float  #: its evidence, see :class:`terrain.discrepancy.evidence.WaldTest`
     dispersion: float  #: as there
     caveat: str = ""  #: what the values depend on, in words; empty where they are the same throughout
-    tier: Tier = Tier.NAMED  #: named or candidate
+    tier: Tier = Tier.NAMED  #: named, set (of which it is the member that is built in), or candidate
     reason: str = ""  #: why it is no more than a candidate; empty where it is named
 
 
@@ -167,10 +168,9 @@ class Residual(NamedTuple):
 
 
 class ChannelVerdict(NamedTuple):
-    """What is off in one channel, what explains it, and what that removes on data held out.
+    """What is off in one channel, what is built in for it, and what that removes on data held out.
 
-    Root mean squares are of measured minus simulated behind the common low-pass, in the channel's unit.  Gains are
-    parts of the square that are removed, with 95 % intervals; NaN where nothing was built in, or not measured.
+    The other fields are those of :class:`terrain.discrepancy.gain.ChannelGain`.
     """
 
     channel: str
@@ -178,10 +178,13 @@ class ChannelVerdict(NamedTuple):
     causes: tuple[str, ...]  #: effects built in that act on it
     rms_before: float
     rms_after: float
-    gain: float  #: by what was built in
+    gain: float
     gain_ci: tuple[float, float]
-    learner_gain: float  #: by the black-box learner, on the same data
+    refused: bool
+    learner_rms: float
+    learner_gain: float
     learner_ci: tuple[float, float]
+    left_ci: tuple[float, float]
 
 
 class NextDrive(NamedTuple):
@@ -211,7 +214,7 @@ class Diagnosis:
     robot: str
     verdict: Tier | None
     causes: tuple[Cause, ...]  #: that are named
-    covariance: Covariance  #: of the causes' parameters
+    covariance: Covariance  #: of the parameters of all that is built in
     ambiguous_sets: tuple[tuple[str, ...], ...]
     """Effects of which one is present, not distinguished; best fit first."""
     ambiguous_values: dict[str, tuple[Value, ...]]  #: fitted values of each of them, by the effect's name
@@ -223,15 +226,28 @@ class Diagnosis:
     clocks: tuple[Clock, ...]
     next_drive: NextDrive | None  #: None where nothing is to be distinguished
     residual_before: dict[str, Residual]  #: by channel, with the simulation given
-    residual_after: dict[str, Residual]  #: with the causes built in
+    residual_after: dict[str, Residual]  #: with these built in
     n_runs: int  #: that were compared
     varying: tuple[Varying, ...] = ()
     faults: tuple[Fault, ...] = ()  #: of channels, which were repaired before anything was compared
     by_session: tuple[BySession, ...] = ()  #: values of the named causes; empty where runs are of one session
     candidates: tuple[Cause, ...] = ()  #: the strongest evidence first
-    channels: tuple[ChannelVerdict, ...] = ()  #: by channel, once the gain was measured
+    of_sets: tuple[Cause, ...] = ()  #: of each set the effect that is built in, which fits best
+    channels: tuple[ChannelVerdict, ...] = ()
+    gain: Gain | None = None  #: on data held out
 
     @property
     def values(self) -> dict[str, float]:
-        """The parameters of all named causes."""
-        return {value.name: value.value for cause in self.causes for value in cause.parameters}
+        """The parameters of all effects that extend the simulation."""
+        return {value.name: value.value for cause in self.built_in for value in cause.parameters}
+
+    @property
+    def differing_channels(self) -> tuple[str, ...]:
+        """The channels of the effect that varies, and of causes whose caveat is the run."""
+        doubtful = [cause for cause in self.built_in if "run" in cause.caveat and cause.channels]
+        return *[effect.channel for effect in self.varying], *[cause.channels[0] for cause in doubtful]
+
+    @property
+    def built_in(self) -> tuple[Cause, ...]:
+        """The effects that extend the simulation: those named, and the best of each set."""
+        return (*self.causes, *self.of_sets)

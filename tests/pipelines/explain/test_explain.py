@@ -45,20 +45,22 @@ def test_the_hidden_cause_is_named_built_in_and_absent_when_tested_again(terrain
     assert abs(value["value"] - 0.04) < 4 * std
     lines = out.splitlines()
     assert "camera yaw" in lines[0]
-    assert "held-out runs the extension removes" in lines[0]
+    assert "Judged on 2 runs held out, the extension removes" in lines[0]
     assert len(lines) <= 25
     assert sorted(found["used"] + found["held_out"]) == [f"husky_{i}" for i in range(7)]
     assert len(found["held_out"]) == 2
     gain = found["gain"]
-    assert (gain["measured"], gain["refused"], gain["runs"]) == (True, False, found["held_out"])
+    assert (gain["refused"], gain["runs"], gain.get("built_in_before")) == (False, found["held_out"], None)
     assert gain["filter"]["errors"]["speed_mps"]["before"] > 0.0
     (statement,) = [each for each in found["statements"] if each["channel"] == "speed_y_mps"]
     assert statement["causes"] == ["camera_yaw"]
     assert "° to the right its error falls from" in statement["text"]
     assert statement["text"][1:] in out
     assert statement["rms_after"] < 0.5 * statement["rms_before"]
-    named = gain["black_box_reference"]["channels"]["speed_y_mps"]["named_reduction"]
-    assert named == pytest.approx(gain["channels"]["speed_y_mps"]["reduction"], abs=0.01)
+    (channel,) = [each for each in found["channels"] if each["channel"] == "speed_y_mps"]
+    assert (channel["tier"], channel["causes"]) == ("named", ["camera_yaw"])
+    assert channel["gain"] == gain["channels"]["speed_y_mps"]["reduction"]
+    assert channel["gain_ci"][0] > 0.5 * channel["learner_gain"] > 0.2
 
     late = {part["name"]: part for part in found["powertrain"]["parts"] if part["status"] == "found"}
     assert set(late) == {"delay_s", "time_constant_s"}
@@ -77,7 +79,12 @@ def test_the_hidden_cause_is_named_built_in_and_absent_when_tested_again(terrain
     assert (again["verdict"], again["causes"]) == (None, [])
     assert again["effects"] == ["gyro_scale", "camera_yaw", "lever_arm"]
     assert not (place / "again" / EXTENDED_FILE).exists()
-    assert "not measured: no cause was named" in out
+    assert "nothing is built in" in out
+    before = again["gain"]["built_in_before"]
+    assert len(before["runs"]) == 4
+    assert before["channels"]["speed_y_mps"]["ci"][0] > 0.5
+    source = yaml.safe_load(extended.read_text())["effects"]["camera_yaw_rad"]["source"]
+    assert "of the square where it acts, judged on 2 runs held out" in source
 
 
 def test_runs_are_explained_without_files_and_the_extended_robot_is_simulated(a_run, few, tmp_path):

@@ -10,8 +10,8 @@ from pipelines.report.numbers import NOT_KNOWN
 from pipelines.report.terminal import terminal_text
 from terrain.discrepancy import verdict
 from terrain.discrepancy.diagnosed_runs import HeldOutGain
-from terrain.discrepancy.held_out import Change, ChannelGain, Comparison, Gain
-from terrain.discrepancy.learner import ChannelReference, Reference
+from terrain.discrepancy.gain import Gain
+from terrain.discrepancy.held_out import Change, Comparison
 from terrain.discrepancy.patterns import Kind
 from terrain.discrepancy.runs import Excluded, measured_channels
 from terrain.discrepancy.verdict import Clock
@@ -32,11 +32,17 @@ LEVER_ARM = verdict.Cause(
 )
 
 
-def a_gain(refused=False, high=0.8, **comparisons):
-    channel = ChannelGain(0.02, 0.01, 2.0, np.nan, 0.75, (-0.1 if refused else 0.7, high), refused)
-    whole = 0.5, (-0.2 if refused else 0.4, 0.6), refused
-    gain = Gain(("r1", "r2"), (), "thirds of runs", {"speed_x_mps": channel}, *whole)
+def a_gain(refused=False, **comparisons):
+    """Return a gain on two runs, and the verdict of its only channel."""
+    ends = (-0.2 if refused else 0.4, 0.6), refused
+    gain = Gain("2 runs held out", ("r1", "r2"), (), "thirds of runs", {}, 0.5, *ends, 0.76, (0.7, 0.8))
     return HeldOutGain(gain, None, {"filter": None, **comparisons})
+
+
+AHEAD = verdict.ChannelVerdict(
+    *("speed_x_mps", verdict.Tier.NAMED, ("lever_arm",), 0.02, 0.01),
+    *(0.75, (0.7, 0.8), False, 0.009, 0.76, (0.7, 0.8), (-0.02, 0.02)),
+)
 
 
 @pytest.fixture
@@ -47,13 +53,17 @@ def explained(few):
         empty = {
             "robot": "a<b>",
             "causes": (),
+            "channels": (),
+            "unexplained": (),
+            "candidates": (),
             "detection_limits": LIMITS,
             "not_shown": (),
             "next_drive": None,
         }
         empty["ruled_out"] = (verdict.RuledOut("scrub", "the runs show nothing of it", 0.44),)
         diagnosed = replace(few.diagnosed, diagnosis=replace(few.diagnosis, **(empty | findings)))
-        gain = gain or HeldOutGain(None, "nothing was built in")
+        nothing = a_gain().gain._replace(reduction=np.nan, ci=(np.nan, np.nan), refused=True)
+        gain = gain or HeldOutGain(nothing)
         return replace(few, diagnosed=diagnosed, gain=gain, statements=(), robot=robot)
 
     return make
@@ -68,24 +78,26 @@ def test_the_answer_is_the_cause_with_its_interval_and_the_gain(explained):
     result = explained(a_gain(), causes=(LEVER_ARM,))
     answer = result.report.answer.replace("\xa0", " ").replace("\N{MINUS SIGN}", "-")
     assert answer == (
-        "The simulation of a<b> lacks lever arm, 0.1 m (90 mm to 0.11 m) and -50 mm (-60 to -40 mm). On 2 "
-        "held-out runs the extension removes 50.0 % (40.0 to 60.0 %) of the whitened squared residual."
+        "The simulation of a<b> lacks lever arm, 0.1 m (90 mm to 0.11 m) and -50 mm (-60 to -40 mm). "
+        "Judged on 2 runs held out, the extension removes 50 % (40 to 60 %) of the square, a black-box learner 76 %."
     )
     text = text_of(result)
     assert "lever arm 0.1 m 90 mm to 0.11 m 40.0 % 9.0" in text
     assert "No log distinguishes lever arm from an alias." in text
     nothing = explained().report.answer
     assert nothing.startswith(
-        "These runs show nothing that the simulation of a<b> lacks. The gain on held-out runs"
+        "These runs show nothing that the simulation of a<b> lacks. Judged on 2 runs held out, nothing is built in"
     )
 
 
-REFERENCE = Reference(2, 0.76, 0.75, {"speed_x_mps": ChannelReference(0.02, 0.01, 0.76, 0.75, -0.02)})
 FILTER = Comparison("vio12", None, 2, {"speed_mps": Change(0.1, 0.05, (-0.06, -0.04))})
 CLASSIFIER = Comparison("svm", None, 2, {"accuracy": Change(0.8, 0.9, None)}, ("a",))
 RIVALS = {
     name: (verdict.Value(f"{name}_ratio", 0.2, "ratio", 0.1, 0.3),) for name in ("payload", "motor_constant")
 }
+OF_SET = LEVER_ARM._replace(
+    name="payload", aliases=(), parameters=RIVALS["payload"], tier=verdict.Tier.SET, channels=("current_a",)
+)
 GROUPS = verdict.RunGroup(0.0, 0.01, ("a", "b")), verdict.RunGroup(0.3, 0.01, tuple("cdefgh"))
 PAYLOAD = verdict.Varying(
     *("payload", "payload_ratio", "ratio", ("scrub",), 0.1, 0.14, 9.0, GROUPS, "current_a"),
@@ -100,13 +112,17 @@ LEFT = (
 @pytest.mark.parametrize(
     ("findings", "stated"),
     [
-        ({"gain": a_gain(refused=True)}, ("no gain can be claimed", "no gain to claim")),
-        ({"gain": a_gain(refused=True, high=-0.05)}, (" worse ",)),
+        ({"gain": a_gain(refused=True)}, ("50 % (-20 to 60 %) of the square, which may be nothing",)),
         (
-            {"gain": replace(a_gain(filter=FILTER, classifier=CLASSIFIER), black_box=REFERENCE)},
+            {"gain": replace(a_gain(), built_in_before=a_gain().gain)},
             (
-                "speed ahead m/s 0.02 0.01 75.0 % 70.0 to 80.0 % 76.0 %",
-                "reference 76 %: little is left to find.",
+                "Effects that the description has already: Judged on 2 runs held out, the extension removes 50 %",
+            ),
+        ),
+        (
+            {"gain": a_gain(filter=FILTER, classifier=CLASSIFIER), "channels": (AHEAD,)},
+            (
+                "speed ahead m/s named lever arm 0.02 0.01 75.0 % 70.0 to 80.0 % 76.0 % 70.0 to 80.0 %",
                 "speed, root mean square m/s 0.1 0.05 -0.06 to -0.04",
                 f"accuracy 0.8 0.9 {NOT_KNOWN}",
             ),
@@ -116,9 +132,10 @@ LEFT = (
             ("vio12 is not measured: no camera",),
         ),
         (
-            {"ambiguous_sets": (tuple(RIVALS),), "ambiguous_values": RIVALS},
+            {"ambiguous_sets": (tuple(RIVALS),), "ambiguous_values": RIVALS, "of_sets": (OF_SET,)},
             (
-                "One of payload or motor constant is present, and these runs cannot distinguish them.",
+                "One of payload or motor constant is present, and these runs cannot distinguish them. Built in is "
+                "what fits best, payload, 20 % (10 to 30 %).",
                 "20 % (10 to 30 %) accelerations and slopes; speed ahead distinguishes it from motor constant",
             ),
         ),

@@ -11,15 +11,16 @@ from terrain.discrepancy.compared import (
     ComparedRun,
     Slope,
     off_by,
+    rms_of,
     slope_through_zero,
     slopes_of,
     terrains_apart,
 )
-from terrain.discrepancy.held_out import ChannelGain, Gain
 from terrain.discrepancy.robot_terms import in_robot_terms
-from terrain.discrepancy.runs import TerrainMatch
+from terrain.discrepancy.runs import TerrainMatch, measured_channels
 from terrain.discrepancy.verdict import (
     Cause,
+    ChannelVerdict,
     Covariance,
     Diagnosis,
     Limit,
@@ -65,8 +66,24 @@ def a_diagnosis(**more):
     return Diagnosis(**(empty | {"covariance": Covariance((), np.empty((0, 0)))} | more))
 
 
-def sentence(runs, gain=None, **more):
-    (statement,) = statements_of(a_diagnosis(**more), HUSKY, runs, gain)
+def channels_of(runs, causes=(), rms=None):
+    """Return the verdicts of channels as runs are compared, or with errors that are given."""
+    verdicts = []
+    for name in measured_channels(runs):
+        after = rms_of(runs, name, True) if runs[0].after is not None else math.nan
+        errors = rms or (rms_of(runs, name, False), after)
+        none = math.nan, (math.nan, math.nan)
+        verdicts.append(
+            ChannelVerdict(
+                name, None, tuple(c.name for c in causes), *errors, *none, True, math.nan, *none, none[1]
+            )
+        )
+    return tuple(verdicts)
+
+
+def sentence(runs, rms=None, **more):
+    channels = channels_of(runs, more.get("causes", ()), rms)
+    (statement,) = statements_of(a_diagnosis(channels=channels, **more), HUSKY, runs)
     return statement.text
 
 
@@ -92,14 +109,12 @@ def test_the_factor_or_level_comes_back_within_its_error_although_some_runs_are_
 
 
 def test_a_channel_states_factor_cause_in_the_robots_quantities_and_its_error_on_held_out_runs():
-    change = ChannelGain(0.746, 0.148, 3.0, 1.0, 0.96, (0.94, 0.97), False)
-    gain = Gain(("a",), (), "runs", {YAW: change}, 0.5, (0.4, 0.6), False)
     runs = runs_of(8, 0.4, after=0.4)
-    assert sentence(runs, gain, causes=(TRACK,)) == (
+    assert sentence(runs, (0.746, 0.148), causes=(TRACK,)) == (
         "yaw rate (gyro): the simulation turns 2.5 times too fast; with an effective track of 1.43 m "
-        "(described: 0.571 m) its error falls from 0.75 to 0.15 rad/s on held-out runs."
+        "(described: 0.571 m) its error falls from 0.75 to 0.15 rad/s on data held out."
     )
-    assert "from 0.43 to 0.02 rad/s on the runs compared" in sentence(runs, causes=(TRACK,))
+    assert "from 0.43 to 0.02 rad/s on data held out" in sentence(runs, causes=(TRACK,))
 
 
 LATE_VALUE = Value("clock_offset_s", -0.27, "s", -0.28, -0.26)
@@ -126,7 +141,7 @@ RIVALS = {
         (
             runs_of(4),
             {},
-            "yaw rate (gyro): measured and simulated agree to 0.02 rad/s rms on the runs compared.",
+            "yaw rate (gyro): measured and simulated agree to 0.02 rad/s rms on data held out.",
         ),
         (
             runs_of(6, level=2.0, channel=CURRENT, std=0.1),
@@ -142,12 +157,12 @@ RIVALS = {
         (
             runs_of(8, 0.9, std=0.5, after=0.999),
             {"causes": (TRACK,)},
-            "its error stays at 0.51 rad/s on the runs compared.",
+            "its error stays at 0.51 rad/s on data held out.",
         ),
         (
             runs_of(8, after=1.5),
             {"causes": (TRACK,)},
-            "its error rises from 0.02 to 0.35 rad/s on the runs compared.",
+            "its error rises from 0.02 to 0.35 rad/s on data held out.",
         ),
         (
             runs_of(6, 1.2, channel=CURRENT),
@@ -193,11 +208,11 @@ def test_only_the_sum_of_a_described_lever_and_the_one_found_counts():
 def test_terrains_that_differ_or_are_bumpy_are_named_where_runs_differ_only():
     runs = [a_run(i, 0.6 - 0.1 * (i > 4), terrain="sand" if i > 4 else "asphalt") for i in range(10)]
     doubtful = a_diagnosis(causes=(TRACK._replace(caveat="it differs from run to run by 0.3 ratio"),))
-    apart = terrains_apart(doubtful, runs)
+    apart = terrains_apart(doubtful.differing_channels, runs)
     assert {label: round(slope.ratio, 2) for label, slope in apart.items()} == {"asphalt": 0.6, "sand": 0.5}
-    assert terrains_apart(a_diagnosis(causes=(TRACK,)), runs) == {}
+    assert terrains_apart(a_diagnosis(causes=(TRACK,)).differing_channels, runs) == {}
     alike = [run._replace(terrain="ab"[i % 2]) for i, run in enumerate(runs[:5])]
-    assert terrains_apart(doubtful, alike) == {}
+    assert terrains_apart(doubtful.differing_channels, alike) == {}
     first, second = notes_of(a_diagnosis(), [TerrainMatch("gravel", "gravel", 0.25)], apart)
     assert "25 % of the measured tilt" in first
     assert "measured over simulated is 0.60 on asphalt and 0.50 on sand." in second

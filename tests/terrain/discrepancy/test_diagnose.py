@@ -134,7 +134,7 @@ def test_what_is_hidden_is_named_with_its_value_and_nothing_beside_it(worlds, ro
         return
     assert diagnosis.verdict == Tier.NAMED
     assert are_right(diagnosis, hidden)
-    assert diagnosis.causes[0].gain_ci[0] > 0
+    assert diagnosis.causes[0].held_out_gain > 0
     before, after = (
         sum(residual.systematic for residual in residuals.values())
         for residuals in (diagnosis.residual_before, diagnosis.residual_after)

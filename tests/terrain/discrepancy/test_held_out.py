@@ -7,9 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from terrain.discrepancy.compared import compare_runs
 from terrain.discrepancy.diagnosed_runs import extended_effects
+from terrain.discrepancy.gain import gain_of
 from terrain.discrepancy.health.fault import Change, Column, Fault, FaultKind
-from terrain.discrepancy.held_out import gain_of_signals, repair_held_out, split_runs
+from terrain.discrepancy.held_out import repair_held_out, split_runs
 from terrain.discrepancy.runs import Simulation, low_pass_of, signals_of
 from terrain.discrepancy.verdict import INTERVAL_T
 from terrain.effects import CHANNELS, GYRO
@@ -40,9 +42,12 @@ def longer():
     return signals(7, LONGER)
 
 
-def gain(runs, effects, seed=0, scatter=True):
-    simulation = Simulation(HUSKY, scatter=spread_numbers("scatter") if scatter else {})
-    return gain_of_signals(simulation, simulation.with_effects(effects), runs, seed)
+def gain(runs, effects, seed=0):
+    simulation = Simulation(HUSKY, scatter=spread_numbers("scatter"))
+    low_pass = low_pass_of(runs)
+    compared = compare_runs(simulation, simulation.with_effects(effects), runs, low_pass)
+    none = [np.zeros_like(run.measured) for run in compared]
+    return gain_of(compared, none, dict.fromkeys(CHANNELS, 0.01), seed, "7 runs held out")
 
 
 def test_the_true_extension_leaves_noise_and_scatter(longer):
@@ -52,30 +57,19 @@ def test_the_true_extension_leaves_noise_and_scatter(longer):
     assert ahead.ci[0] > 0.5
     # what is left ahead: noise, and radii that scatter by 0.003 of 0.4 m/s
     assert ahead.rms_after < 0.006 < ahead.rms_before
-    assert ahead.white_after < 1.3
+    assert ahead.reduction == pytest.approx(1.0 - (ahead.rms_after / ahead.rms_before) ** 2)
     assert found.channels["turning_current_a"].refused
+    assert (ahead.learner_reduction, ahead.learner_rms) == (0.0, ahead.rms_before)
+    assert gain(longer[:2], LONGER).clusters == "thirds of runs"
 
 
 def test_no_gain_is_claimed_for_nothing_for_the_wrong_sign_or_where_nothing_is_hidden(longer):
     nothing = gain(longer, {})
     assert (nothing.reduction, nothing.ci, nothing.refused) == (0.0, (0.0, 0.0), True)
-    wrong = gain(longer, {"wheel_radius_ratio": -0.03})
+    wrong = gain(longer, {"wheel_radius_ratio": -0.03}).channels["speed_x_mps"]
     assert wrong.refused
     assert wrong.ci[1] < 0.0
     assert gain(signals(6, {}), LONGER).refused
-    with pytest.raises(DataError, match="no run that was not used"):
-        gain([], LONGER)
-
-
-def test_without_scatter_the_gain_is_that_of_the_whitened_squares(longer):
-    """Two routes: the form that has scatter integrated out, and plain sums over the channels."""
-    found = gain(longer, LONGER, scatter=False)
-    before, after = (
-        sum(getattr(channel, key) ** 2 for channel in found.channels.values())
-        for key in ("white_before", "white_after")
-    )
-    # channels have all the same rows here
-    assert found.reduction == pytest.approx(1.0 - after / before, rel=1e-9)
 
 
 # -- Which runs are held out of a diagnosis, and which of them have the faults that were found in the others --
@@ -92,6 +86,19 @@ def test_every_terrain_is_held_out_in_proportion_and_the_seed_chooses_runs():
     assert split_runs(runs, 0, 0) == (runs, [])
     with pytest.raises(DataError, match="--hold-out is 14 of 16"):
         split_runs(runs, 14, 0)
+
+
+@pytest.mark.parametrize("n_sessions", [2, 3, 8])
+@pytest.mark.parametrize("hold_out", [None, 3])
+def test_whole_sessions_are_held_out_where_several_are_named(n_sessions, hold_out):
+    runs = [
+        RunLog(f"r{i}", "husky", {}, ((0.0, 1.0, "ab"[i % 2]),), session=f"session {i % n_sessions}")
+        for i in range(16)
+    ]
+    used, held = split_runs(runs, hold_out, 1)
+    assert {run.session for run in used}.isdisjoint(run.session for run in held)
+    assert len(held) >= (hold_out or 2)
+    assert len(used) + len(held) == 16
 
 
 def test_a_fault_is_repaired_in_the_held_out_runs_that_have_it():

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from pipelines.explain.statements import reference_text
 from pipelines.report.results import as_json
 from terrain.discrepancy.compared import ComparedRun
-from terrain.discrepancy.learner import DRIVEN, black_box_reference
+from terrain.discrepancy.gain import gain_of
+from terrain.discrepancy.learner import DRIVEN, predicted_residuals
 from terrain.effects import CHANNELS
 
 # -- A black-box reference finds what depends on the inputs, no more than is there, beside the names -----------
@@ -29,33 +29,32 @@ def a_run(seed, hidden=0.0, named=None, late=0, n=300):
     return ComparedRun(f"r{seed}", "", False, time_s, np.ones(n), *compared, inputs)
 
 
-def reference(hidden, named, late=0, n_judged=8):
-    used, judged = (
+def judged(hidden, named, late=0, n_judged=8):
+    used, runs = (
         [a_run(seed, hidden, named, late) for seed in seeds]
         for seeds in (range(12), range(50, 50 + n_judged))
     )
-    found = black_box_reference(used, judged, {CHANNEL: STD})
-    return found.channels[CHANNEL], reference_text(found)
+    gain = gain_of(runs, predicted_residuals(used, runs), {CHANNEL: STD}, 0, "8 runs held out")
+    return gain.channels[CHANNEL], gain
 
 
 @pytest.mark.parametrize("late", [-1, 0, 1])
 def test_it_finds_what_depends_on_the_inputs_also_if_sensors_are_late(late):
-    channel, text = reference(0.5, named=0.0, late=late)
-    assert channel.rms_after == pytest.approx(STD, rel=0.15)
-    assert channel.reduction > 0.85
-    assert text.endswith("more is left to find in speed ahead.")
+    channel, gain = judged(0.5, named=0.0, late=late)
+    assert channel.learner_rms == pytest.approx(STD, rel=0.15)
+    assert channel.learner_ci[0] > 0.85
+    assert channel.left_ci[0] > 0.85
+    assert gain.learner_reduction == pytest.approx(channel.learner_reduction)
 
 
-def test_where_the_names_are_right_and_in_noise_little_is_left_and_few_runs_state_no_more():
-    channel, text = reference(0.5, named=0.5)
-    assert channel.named_reduction == pytest.approx(channel.reduction, abs=0.03)
-    assert text.endswith("little is left to find.")
-    channel, text = reference(0.0, named=None)
-    assert abs(channel.reduction) < 0.05
-    assert as_json(channel)["named_reduction"] is None
-    assert text.startswith("Nothing was named")
-    assert text.endswith("little is left to find.")
-    channel, text = reference(0.5, named=0.0, n_judged=2)
-    assert math.isnan(channel.left_to_find_from)
-    assert text.endswith("2 runs are too few to state more.")
-    assert black_box_reference([a_run(1)], [], {}) is None
+def test_where_the_names_are_right_and_in_noise_little_is_left_and_one_run_has_no_interval():
+    channel, _ = judged(0.5, named=0.5)
+    assert channel.reduction == pytest.approx(channel.learner_reduction, abs=0.03)
+    assert channel.left_ci[1] < 0.05
+    channel, gain = judged(0.0, named=None)
+    assert abs(channel.learner_reduction) < 0.05
+    assert math.isnan(channel.reduction)
+    assert (gain.refused, as_json(channel)["reduction"]) == (True, None)
+    predicted = predicted_residuals([a_run(1)], [a_run(2)])
+    assert np.isnan(np.delete(predicted[0], C, axis=1)).all()
+    assert np.isnan(predicted_residuals([], [a_run(2)])[0]).all()
