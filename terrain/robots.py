@@ -831,13 +831,23 @@ KIND_OF_DRIVE: dict[str, type[Robot]] = {
 }
 
 #: Numbers of the section ``identified``, which logs of one robot showed and no nominal figure is: the least
-#: value of each, None for above zero (:mod:`terrain.calibration.skid_steer`, :mod:`terrain.calibration.omni`).
+#: value of each, None for above zero (:mod:`terrain.calibration.skid_steer`, :mod:`terrain.calibration.omni`,
+#: :mod:`terrain.calibration.poses`).
 IDENTIFIED: Mapping[str, float | None] = {
     "rolling_radius_m": None,
     "effective_track_m": None,
     "lidar_delay_s": -math.inf,
     "wheels_delay_s": -math.inf,
     "wheel_distance_m": None,
+    "wheelbase_m": None,
+    "effective_wheelbase_m": None,
+    "steering_gain_ratio": None,
+    "steering_offset_rad": -math.inf,
+    "understeer_s2pm": -math.inf,
+    "pose_x_m": -math.inf,
+    "pose_y_m": -math.inf,
+    "pose_yaw_rad": -math.inf,
+    "pose_delay_s": -math.inf,
 }
 
 

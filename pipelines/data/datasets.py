@@ -34,7 +34,7 @@ ACCEPTED = (
     "accepted are run folders (run.json), the BorealTC layout (<CLASS>/imu_N.csv and pro_N.csv), "
     "the DRIVE layout (samples.csv.gz, or folders of sessions with one each), its whole recordings "
     "(<robot>_<terrain>/*.csv.gz), the Robotino layout (camera_params.json over folders of .csv.gz), "
-    "the wheel testbed's (smooth.csv, grouser.csv), MCAP files and ROS 2 bags, and "
+    "the wheel testbed's (smooth.csv, grouser.csv), ticks of a tricycle (.txt, .txt.gz), MCAP files and bags, and "
     "any CSV with a mapping file"
 )
 """What a refusal lists."""
@@ -49,6 +49,7 @@ FOUND_BY: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "drive-recording": ("terrain.logs.drive:find_recordings", ("*.csv.gz", "*/*.csv.gz")),
     "testbed": ("terrain.logs.testbed:find_runs", ("smooth.csv", "grouser.csv")),
+    "tricycle": ("terrain.logs.tricycle:find_runs", ("*.txt", "*.txt.gz")),
 }
 """What finds the runs of each layout, and patterns of its files: without one of these it is not even imported."""
 
@@ -200,7 +201,8 @@ def verdict(run: RunLog, robot: Robot | None = None) -> tuple[Check, ...]:
         known = robot_named(run.robot, robot)
     except ConfigError:
         return judge(run)
-    return judge(run, Scale(known.track_m, _wheel_rate_max_radps(known) * known.wheel_radius_m))
+    fastest_mps = getattr(known, "speed_max_mps", _wheel_rate_max_radps(known) * known.wheel_radius_m)
+    return judge(run, Scale(known.track_m, fastest_mps))
 
 
 def _wheel_rate_max_radps(robot: Robot) -> float:

@@ -11,7 +11,17 @@ from terrain.errors import ConfigError
 from terrain.files.names import listed, shown
 
 Layout = Literal[
-    "auto", "runs", "borealtc", "csv", "drive", "drive-recording", "robotino", "testbed", "can", "bag"
+    "auto",
+    "runs",
+    "borealtc",
+    "csv",
+    "drive",
+    "drive-recording",
+    "robotino",
+    "testbed",
+    "tricycle",
+    "can",
+    "bag",
 ]
 """``auto``: found out; ``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping
 file; ``drive``: the files ``samples.csv.gz`` of DRIVE, one a session; ``drive-recording``: its whole

@@ -54,8 +54,6 @@ def calibrate(settings: Settings, progress: Progress) -> CalibrationResult:
     path = description_file(settings.robot)
     file, description = path.name, read_yaml(path)
     robot = robot_from(file, description)
-    if not robot.skids:
-        robot.require(*robot.sections)
     if robot.effects:  # what is calibrated would hold them a second time
         raise ConfigError(
             f"robot {robot.name}: {file} is extended by effects; calibrate the description without them, "

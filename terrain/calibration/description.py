@@ -12,6 +12,7 @@ import yaml
 from terrain.calibration.finding import Finding
 from terrain.calibration.lag import starts_and_stops, time_constants
 from terrain.calibration.omni import identify_omni
+from terrain.calibration.poses import kinematic_of, pose_findings
 from terrain.calibration.sensors import MIN_POSITION_S, accelerometer, gyro_bias, sensor_noise, standing
 from terrain.calibration.skid_steer import identify
 from terrain.calibration.wheels import (
@@ -52,7 +53,8 @@ def hard_grounds() -> tuple[str, ...]:
 def findings_of(runs: Sequence[RunLog], description: Any, robot: Robot, hard: Sequence[str]) -> list[Finding]:
     """Return what the runs of a robot show, by its drive, beside what its description has.
 
-    ``DataError`` if a run is another robot's, or those of a skid-steer robot have no lidar.
+    ``DataError`` if a run is another robot's, or those of a skid-steer robot have no lidar; ``ConfigError`` if the
+    description lacks a section.
     """
     if robot.skids and not any("lidar" in run.streams for run in runs):
         raise DataError(
@@ -67,8 +69,12 @@ def findings_of(runs: Sequence[RunLog], description: Any, robot: Robot, hard: Se
     if robot.skids:
         findings = identify(runs, robot.wheel_radius_m, hard)
     elif isinstance(robot, OmniRobot):
+        robot.require(*robot.sections)
         findings = identify_omni(runs, robot)
+    elif kinematic_of(robot) and any("pose" in run.streams for run in runs):
+        findings = pose_findings(runs, robot)
     else:
+        robot.require(*robot.sections)
         resting = [stretch for run in runs for stretch in standing(run, robot)]
         held = [stretch for run in runs for stretch in standing(run, robot, MIN_POSITION_S)]
         findings = [*gyro_bias(resting, robot), *accelerometer(held, robot), *sensor_noise(resting, robot)]

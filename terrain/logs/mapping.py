@@ -10,7 +10,10 @@ others by then.  What is wrong with messages is refused at once, or counted wher
 Of tables a word in braces stands for any text without a slash, and the files of which all such words agree make one
 run; every stream has the same words.  Several streams may name one file, and the files of a run may be of different
 formats, bags too; ``offset`` brings their times onto one clock.  ``position`` becomes the channels
-:data:`POSITION_CHANNELS`.  The files lie under the data folder, and so does what links in it lead to.  The robot is a
+:data:`POSITION_CHANNELS`.  A channel with ``rate`` is the rate of the number there, as of an encoder's
+counts or position; a counter begins anew after ``wraps`` of them (:mod:`terrain.logs.counters`).
+
+The files lie under the data folder, and so does what links in it lead to.  The robot is a
 name, of the package or of the description that the user gives.  Names are compared in Unicode's normal form C,
 whichever form the file system keeps.
 
@@ -44,6 +47,7 @@ from terrain.files.names import (
     plain_name,
     shown,
 )
+from terrain.logs.counters import count_rates, unwrapped_counts
 from terrain.logs.run_folders import label_intervals
 from terrain.logs.samples import (
     check_log_file,
@@ -86,9 +90,12 @@ class Source(Strict):
     unit: Unit = ""
     scale: FiniteFloat = 1.0
     offset: FiniteFloat = 0.0
+    rate: bool = False
+    wraps: Annotated[FiniteFloat, Field(gt=0.0)] | None = None
 
     def si(self, numbers: Array, unit: str) -> Array:
         """Return numbers, which are in a unit once they are scaled, in the SI unit; what overflows is not finite."""
+        numbers = numbers if self.wraps is None else unwrapped_counts(numbers, self.wraps)
         with np.errstate(over="ignore", invalid="ignore"):
             scaled = (numbers * self.scale + self.offset) * UNIT_SCALES[unit][1]
             return np.asarray(scaled + UNIT_OFFSETS.get(unit, 0.0))
@@ -116,7 +123,8 @@ class MessageField(Source):
 
     def turns(self, desired: str) -> bool:
         """Return whether it is a speed whose joint turns: its rate is multiplied by the wheel's radius."""
-        turning = self.field == "velocity" and self.number_unit in ("rad/s", "deg/s", "rpm")
+        units = ("rad", "deg", "mrad") if self.rate else ("rad/s", "deg/s", "rpm")
+        turning = self.field == ("position" if self.rate else "velocity") and self.number_unit in units
         return desired == "mps" and bool(self.joint) and turning
 
 
@@ -191,12 +199,12 @@ ReadMessages = Callable[[Path, str, MessageStream, "Counter[str] | None"], Strea
 
 
 def load_mapping(path: str | Path) -> TableMapping:
-    """Return the mapping of tables that a YAML file describes.
+    """Return the mapping of tables that a YAML file, or a packaged one of that name, describes.
 
     ``ConfigError`` where the file cannot be read, a key is unknown or missing, a unit is unknown or does not suit its
     channel, or the file patterns do not agree on the words in braces.
     """
-    path = Path(path)
+    path = _packaged(path, "layouts")
     mapping = accepted(TableMapping, read_yaml(path), path.name, ConfigError)
     check_name(f"{path.name}: robot", mapping.robot, ConfigError)
     words = {name: set(_WORD.findall(stream.file)) for name, stream in mapping.streams.items()}
@@ -220,7 +228,7 @@ def load_mapping(path: str | Path) -> TableMapping:
                 raise ConfigError(f"{place} {both}; numbers with a comma need another delimiter, such as ';'")
             check_unit(f"{place} time", stream.time.unit, "s")
             for channel, column in stream.channels.items():
-                check_unit(f"{place} channel {channel}", column.unit, _unit_required(place, channel))
+                check_unit(f"{place} channel {channel}", column.unit, _unit_required(place, channel, column))
         if words[name] != words[first]:
             raise ConfigError(f"{path.name}: streams {first} and {name} do not have the same words in braces")
         if re.search(r"[{}]", _WORD.sub("", file)):
@@ -239,6 +247,13 @@ def load_mapping(path: str | Path) -> TableMapping:
     return mapping
 
 
+def _packaged(path: str | Path, folder: str) -> Path:
+    """Return the file of a mapping: the path itself, or the packaged one of that name."""
+    path = Path(path)
+    packaged = data_folder(folder) / f"{path}.yaml"
+    return packaged if not path.exists() and plain_name(str(path)) and packaged.is_file() else path
+
+
 def load_topics(path: str | Path) -> TopicMapping:
     """Return the mapping of topics that a YAML file, or a packaged one of that name, describes.
 
@@ -253,10 +268,7 @@ def load_topics(path: str | Path) -> TopicMapping:
     >>> load_topics("husky_topics").streams["wheels"].topic
     '/joint_states'
     """
-    path = Path(path)
-    packaged = data_folder("bags") / f"{path}.yaml"
-    if not path.exists() and plain_name(str(path)) and packaged.is_file():
-        path = packaged
+    path = _packaged(path, "bags")
     mapping = accepted(TopicMapping, read_yaml(path), path.name, ConfigError)
     for key in ("robot", "terrain"):
         if getattr(mapping, key):
@@ -278,7 +290,9 @@ def check_messages(place: str, stream: MessageStream) -> None:
     if stream.wheel_radius is not None and not joints:
         raise ConfigError(f"{place} 'wheel_radius' is for kind 'joints'")
     for name, channel in stream.channels.items():
-        desired, at, field = _unit_required(place, name), f"{place} channel {name}", channel.field
+        at, field = f"{place} channel {name}", channel.field
+        number = _unit_required(place, name, channel)
+        desired = unit_of(name)
         if joints and field not in JOINT_UNITS:
             raise ConfigError(f"{at}: field {field!r} is none of {', '.join(JOINT_UNITS)}")
         if joints and not channel.joint:
@@ -290,14 +304,23 @@ def check_messages(place: str, stream: MessageStream) -> None:
         if not _PATH.fullmatch(field):
             raise ConfigError(f"{at}: field {field!r} is no path, as 'twist.linear.x' or 'data[2]' is one")
         if (joints or desired != "code") and not channel.turns(desired):
-            check_unit(at, channel.number_unit, desired)
+            check_unit(at, channel.number_unit, number)
 
 
-def _unit_required(place: str, channel: str) -> str:
+#: Unit of what a rate is the rate of.
+_UNIT_OF_RATE = {"mps": "m", "radps": "rad", "mps2": "mps"}
+
+
+def _unit_required(place: str, channel: str, source: Source) -> str:
     try:
-        return unit_of(channel)
+        unit = unit_of(channel)
     except LogError as error:
         raise ConfigError(f"{place} {error}") from error
+    if not source.rate:
+        return unit
+    if unit not in _UNIT_OF_RATE:
+        raise ConfigError(f"{place} channel {channel}: 'rate' is for channels in m/s, rad/s or m/s^2")
+    return _UNIT_OF_RATE[unit]
 
 
 def find_runs(
@@ -389,6 +412,10 @@ def read_run(
         columns = [normal_name(each) for each in (*(source.column for source in sources), *placed)]
         table = read_table(path, columns, layout=layout, sheet=stream.sheet, repairs=repairs).T
         time_s, *values = (source.si(row, source.unit) for row, source in zip(table, sources, strict=False))
+        values = [
+            count_rates(time_s, value) if source.rate else value
+            for value, source in zip(values, sources[1:], strict=True)
+        ]
         if position is not None:
             degrees, to_rad = table[len(sources) :], UNIT_SCALES[position.unit][1]
             origin = np.multiply(position.origin, (to_rad, to_rad, 1.0)) if position.origin else ()
@@ -753,6 +780,9 @@ def mapped_streams(
         channels, joined = source.channels(np.concatenate(parts, axis=1))
         if not channels:
             raise LogError(f"{place}: topic {shown(stream.topic)} states that it measures nothing")
+        for i, channel in enumerate(channels):
+            if channel in stream.channels and stream.channels[channel].rate:
+                joined[:, i] = count_rates((common - common[0]) / 1e9, joined[:, i])
         raw[name] = common, channels, joined
     if start_ns is None:
         stamps = [stamp_ns for stamp_ns, *_ in raw.values()]

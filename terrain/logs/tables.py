@@ -91,7 +91,7 @@ def read_table(
     kind, name = path.suffix.lower(), short_name(path)
     if kind == ".mat":
         return _mat_columns(path, columns)
-    content = b"" if kind == ".xlsx" else _content(path)
+    content = b"" if kind == ".xlsx" else read_bytes(path)
     header, rows = _sheet_rows(path, layout, sheet) if kind == ".xlsx" else _text_rows(path, content, layout)
     places = [_place(path, header, column) for column in columns]
     if content and (fast := _fast(content, len(header), places, layout)) is not None:
@@ -126,7 +126,7 @@ def row_number(path: Path, index: int, *, layout: TextLayout = PLAIN) -> int:
     kind = path.suffix.lower()
     if kind in (".mat", ".xlsx"):
         return index + 1 + (layout.first_row if kind == ".xlsx" else 0)
-    return next(islice(_text_rows(path, _content(path), layout)[1], index, None))[0]
+    return next(islice(_text_rows(path, read_bytes(path), layout)[1], index, None))[0]
 
 
 def text_rows(path: Path, columns: Sequence[str]) -> list[tuple[int, tuple[str, ...] | None]]:
@@ -134,7 +134,7 @@ def text_rows(path: Path, columns: Sequence[str]) -> list[tuple[int, tuple[str, 
 
     The texts are None of a row that is shorter or longer than the header.
     """
-    header, rows = _text_rows(path, _content(path), PLAIN)
+    header, rows = _text_rows(path, read_bytes(path), PLAIN)
     places = [_place(path, header, column) for column in columns]
     return [
         (row, tuple(cells[place] for place in places) if len(cells) == len(header) else None)
@@ -144,7 +144,7 @@ def text_rows(path: Path, columns: Sequence[str]) -> list[tuple[int, tuple[str, 
 
 def header_of(path: Path, layout: TextLayout) -> list[str]:
     """Return the names of the columns of a CSV file."""
-    return _text_rows(path, _content(path), layout)[0]
+    return _text_rows(path, read_bytes(path), layout)[0]
 
 
 def number_in(cell: Any, decimal: str = ".") -> float | None:
@@ -183,7 +183,7 @@ def _place(path: Path, header: Sequence[str], column: str) -> int:
     return header.index(column)
 
 
-def _content(path: Path) -> bytes:
+def read_bytes(path: Path) -> bytes:
     """Return the bytes of a regular file, unpacked."""
     check_regular(path, short_name(path), LogError)
     try:

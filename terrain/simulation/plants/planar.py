@@ -47,7 +47,8 @@ takes its place.  There are no currents.  A tricycle is one whose front wheel dr
 
 **Omni and mecanum robots**: each wheel pulls along its drive direction, rollers resist as they turn.  Wheel i at
 :math:`p_i` carries the share :math:`n_i` of the weight W, turns with the circumferential speed :math:`u_i`, and with
-the twist V of the centre of mass has to turn with :math:`D_i V` for its roller to slip nowhere; its centre moves by :math:`E_i V` across the roller's axis, which is at an angle :math:`g_i` to its drive direction, 0 of an omni wheel
+the twist V of the centre of mass has to turn with :math:`D_i V` for its roller to slip nowhere; its centre moves by
+:math:`E_i V` across the roller's axis, which is at an angle :math:`g_i` to its drive direction, 0 of an omni wheel
 (:mod:`terrain.kinematics.wheels`); the roller turns with :math:`E_i V + u_i \sin g_i`.
 Over the root mean square speed U of the wheels or, where that is larger, of their centres, so that slip does not depend
 on speed, the forces on it are
