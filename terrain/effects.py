@@ -174,6 +174,10 @@ class Parameter(NamedTuple):
         """Words of the name without its unit, as pages write it."""
         return self.name.rpartition("_")[0].replace("_", " ")
 
+    def is_plausible(self, low: float, high: float) -> bool:
+        """Return whether an interval of the whole value reaches into the plausible range."""
+        return low <= self.plausible[1] and high >= self.plausible[0]
+
 
 class Stage(Enum):
     """Where an effect acts in the dynamic simulation."""

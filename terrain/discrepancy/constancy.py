@@ -367,7 +367,7 @@ def varying_effects(problem: Problem, fit: CauseFit) -> tuple[verdict.Varying, .
             own = _own_values(fit, there.counted_from(info.vector), own, known, columns)
         own = own._replace(runs=[runs.in_pattern(problem.signals) for runs in own.runs])
         of = own.clearest
-        (low, high), seen = BOUNDS[of.name], of.weight > 0
+        (low, high), seen = PARAMETER[of.name].plausible, of.weight > 0
         value = info.vector[INDEX[of.name]] + of.value[seen]
         margin = OUT_STDS / np.sqrt(of.weight[seen]) + OUT_SCATTERS * of.scatter
         if np.mean((value < low - margin) | (value > high + margin)) <= OUT_RATIO:

@@ -26,7 +26,7 @@ from terrain.discrepancy.health.faults import faults_of
 from terrain.discrepancy.health.unfit import Clock, clocks_of, unfit_runs
 from terrain.discrepancy.next_drive import MOST, next_drive
 from terrain.discrepancy.probes import TILT_INPUTS, ProbeResult, probe_residuals
-from terrain.discrepancy.robot_terms import UNITS
+from terrain.discrepancy.robot_terms import UNITS, in_robot_terms, quantity
 from terrain.discrepancy.runs import (
     UNLIKE,
     Excluded,
@@ -37,7 +37,18 @@ from terrain.discrepancy.runs import (
     rows_of,
     signals_of,
 )
-from terrain.discrepancy.search import CauseFit, Problem, names_of, pooled, refit, rivals_of, search
+from terrain.discrepancy.search import (
+    RIVAL_LOSS,
+    CauseFit,
+    Problem,
+    fit_again,
+    names_of,
+    pooled,
+    refit,
+    rivals_of,
+    search,
+    search_on,
+)
 from terrain.discrepancy.verdict import Tier
 from terrain.effects import BOUNDS, CHANNELS, Effect, effect_named
 from terrain.errors import DataError
@@ -262,7 +273,7 @@ def statement_of(found: Found, judgement: Judgement) -> verdict.Diagnosis:
         weights = np.eye(len(fit.info.names))[own]
         weights[:, base] = -partial_information(fit.info.a.sum(axis=0), base, own)[0].T
         channel = CHANNELS[int(np.argmax(fit.info.channel_power(weights)))]
-        if channel not in best and out.name not in varies:
+        if channel not in best and out.name not in varies and fit.tests[out.name].z > Z_EFFECT:
             best[channel] = verdict.Unexplained(channel, out.name, out.z, 0.0)
     unexplained = tuple(sorted(best.values(), key=lambda left: -left.z))
 
@@ -379,10 +390,15 @@ def statement_of(found: Found, judgement: Judgement) -> verdict.Diagnosis:
 def _withdraw_wrong(problem: Problem, fit: CauseFit, withdrawn: dict[str, verdict.Cause]) -> CauseFit:
     """Return the causes that may be named; those that were withdrawn are noted by name.
 
-    One is withdrawn at a time, the one that gains least, and the others are fitted anew: a wrong cause
-    distorts the others, and their reasons go with it.
+    Those of a size that is not plausible go first.  Of others one is withdrawn at a time, the one that gains least, and
+    the rest are fitted anew: a wrong cause distorts the others, and their reasons go with it.
     """
     for _ in range(MAX_WITHDRAWN):
+        sizes = {cause: reason for cause in fit.causes if (reason := _beyond_belief(problem, fit, cause))}
+        if sizes:
+            worst = max(sizes, key=lambda cause: raw_gain(fit, cause))
+            fit = _without_implausible(problem, fit, worst, sizes[worst], withdrawn)
+            continue
         reasons = reasons_to_withdraw(problem, fit, _probes(problem, fit))
         if not reasons:
             break
@@ -390,6 +406,16 @@ def _withdraw_wrong(problem: Problem, fit: CauseFit, withdrawn: dict[str, verdic
         worst = min(doubtful, key=lambda cause: raw_gain(fit, cause))
         fit = _withdraw(problem, fit, worst, reasons[worst.name], withdrawn)
     return fit
+
+
+def _without_implausible(
+    problem: Problem, fit: CauseFit, cause: Effect, reason: str, withdrawn: dict[str, verdict.Cause]
+) -> CauseFit:
+    """Withdraw a cause of a size that nobody would believe; other effects take its place if they fit as well."""
+    left = _withdraw(problem, fit, cause, reason, withdrawn)
+    more = search_on(problem._replace(barred=frozenset(withdrawn)), left.info, left.causes)
+    with_it, without = (fit_again(problem, fit.info, names_of(each.causes))[0] for each in (fit, more))
+    return more if without - with_it < RIVAL_LOSS * fit.tests[cause.name].inflation else left
 
 
 def _withdraw_varying(
@@ -522,6 +548,20 @@ def reasons_to_withdraw(
         if reason:
             reasons[cause.name] = f"it reduces the residual, but {reason}"
     return reasons
+
+
+def _beyond_belief(problem: Problem, fit: CauseFit, cause: Effect) -> str:
+    """Return why a cause is larger than a builder would believe, empty where its interval reaches that range."""
+    robot, values = problem.simulation.robot, values_of(fit, cause)
+    for p, value in zip(cause.parameters, values, strict=True):
+        given = problem.simulation.effects.get(p.name, 0.0)
+        if not p.is_plausible(given + value.low, given + value.high):
+            low, high = (quantity(p.name, end) for end in p.plausible)
+            return (
+                f"something that is missing acts like {in_robot_terms(cause.name, values, robot)}, and is not that: "
+                f"{p.label} {low} to {high} is plausible ({p.plausible_source})"
+            )
+    return ""
 
 
 def _at_bound(problem: Problem, fit: CauseFit, cause: Effect) -> str:

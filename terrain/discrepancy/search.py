@@ -48,6 +48,12 @@ class Problem(NamedTuple):
     library: tuple[Effect, ...]
     varying: Mapping[str, float] = MappingProxyType({})
     """Scatter by parameter, beside that of the simulation."""
+    barred: frozenset[str] = frozenset()  #: names of effects of the library that are no causes
+
+    @property
+    def candidates(self) -> tuple[Effect, ...]:
+        """Effects that may be named."""
+        return tuple([effect for effect in self.library if effect.name not in self.barred])
 
     @property
     def scatter(self) -> dict[str, float]:
@@ -164,6 +170,9 @@ SHARED = 0.5
 """Least correlation of what a cause and its rival change: one that shares less with it explains something
 else, and is no rival, however little worse it fits."""
 
+PLAUSIBLE_STDS = 2.36
+"""Standard deviations by which a rival may be beyond its plausible range: the half of a 95 % interval."""
+
 Rivals = Mapping[str, tuple[Array, Array]]
 """By effect that fits as well as a cause in its place, the best first, its values and their standard deviations."""
 
@@ -196,7 +205,9 @@ def rivals_of(
                 its = [p.name for p in effect.parameters]
                 at, places = [INDEX[name] for name in its], here.places(its)
                 std = np.sqrt(np.maximum(np.diag(here.fit(swapped)[1]), 0.0))[places]
-                as_good.append((behind, effect.name, here.vector[at] - info.vector[at], std))
+                ends = here.vector[at] + np.outer((-PLAUSIBLE_STDS, PLAUSIBLE_STDS), std)
+                if all(p.is_plausible(*own) for p, own in zip(effect.parameters, ends.T, strict=True)):
+                    as_good.append((behind, effect.name, here.vector[at] - info.vector[at], std))
         as_good.sort(key=lambda rival: rival[0])
         rivals[cause.name] = {name: (change, std) for _, name, change, std in as_good}
     return rivals
@@ -265,8 +276,13 @@ def search(problem: Problem, start: Evidence, seeds: Mapping[str, float] | None 
         seeded = [effect for effect in problem.library if set(names_of([effect])) & set(seeds)]
         causes = [*seeded, *[cause for cause in first if cause not in seeded]]
         causes, info = _refit_significant(problem, info.counted_from(start.vector), causes)
-    causes, info = _add_causes(problem, info, causes)
-    return cause_fit(problem, info, causes)
+    return search_on(problem, info, causes)
+
+
+def search_on(problem: Problem, info: Evidence, causes: Sequence[Effect]) -> CauseFit:
+    """Return the causes that explain the runs, from some that are fitted to them."""
+    more, at = _add_causes(problem, info, list(causes))
+    return cause_fit(problem, at, more)
 
 
 def refit(problem: Problem, info: Evidence, causes: Sequence[Effect]) -> CauseFit:
@@ -300,7 +316,7 @@ def _add_causes(problem: Problem, info: Evidence, causes: list[Effect]) -> tuple
 
     for _ in range(MAX_STEPS):
         names, candidates = names_of(causes), []
-        left = [effect for effect in problem.library if effect not in causes and effect.name not in barred]
+        left = [e for e in problem.candidates if e not in causes and e.name not in barred]
         for effect in left:
             test = wald_test(info, names, effect)
             gain, passes = float(test.gain.sum()), test.significant
@@ -363,7 +379,7 @@ def _swap_for_better(problem: Problem, info: Evidence, causes: list[Effect]) -> 
         least, better = info.loss(names) + PARAMETER_LOSS * len(names) - RIVAL_LOSS, None
         for i, cause in enumerate(causes):
             others = names_of([other for other in causes if other is not cause])
-            for effect in problem.library:
+            for effect in problem.candidates:
                 if effect in causes or not wald_test(info, others, effect).significant:
                     continue
                 changed = [*causes[:i], effect, *causes[i + 1 :]]
