@@ -512,6 +512,7 @@ def _move_skid(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array
     for k in range(n):
         drag = p.turn_drag_s2 * turn[k] * turn[k]
         u[k] *= 1.0 / (1.0 + drag) if drag > 0.0 else 1.0 - drag  # never turns the motion about
+        u[k] *= 1.0 - p.ground_slip_ratio
         scrub_n[k] = scrub * tight[k] * direction(u[k])
     speed, rest, slip = slip_along(body, p, dt, u, scrub_n, grade_rad, disturbance, False)
     out["speed_x_mps"][:], out["yaw_rate_radps"][:], out["slip_ratio"][:] = speed, turn, slip

@@ -26,7 +26,7 @@ OVER = 4.0
 OF_WHEELS_AND_CURRENTS = {
     "husky": (
         "lever_arm imu_latency one_sided_radius camera_latency clock_rate motor_drift scrub side_hill_slip "
-        "turn_side_slip turn_drag"
+        "turn_side_slip turn_drag ground_slip"
     ),
     "agrimaro": (
         "steering_offset_2 steering_backlash encoder_lag gyro_scale accel_bias force_slip viscous_drag "
@@ -41,6 +41,7 @@ WITHOUT_CURRENTS = (
     ("adap2e", {"steering_offset_front_rad": 0.01}),
     ("adap2e", {"steering_backlash_rad": 0.01}),
     ("marmotte", {"side_hill_slip_ratio": 0.2}),
+    ("marmotte", {"ground_slip_ratio": 0.1}),
     ("patako", {"force_slip_ratio": 0.4}),
     ("patako", {"wheel_radius_ratio": 0.05}),
     ("patako", {"turning_slip_ratio": 0.5, "turning_slip_power_ratio": 0.4}),
@@ -189,18 +190,25 @@ def test_an_effect_of_no_library_or_without_its_entry_is_unexplained(worlds):
 
 def test_exact_twins_are_ambiguous_and_the_channel_that_distinguishes_them_is_named(worlds):
     """Without camera, heading and currents a gyro's scale and an effective track are one and the same."""
-    world, runs = worlds("husky"), []
-    for run in world.runs({"gyro_scale_ratio": 0.1}):
-        wheels = run.streams["wheels"]
-        speeds = Stream(wheels.time_s, wheels.values[:, :2], wheels.channels[:2])
-        runs.append(replace(run, streams={"wheels": speeds, "imu": run.streams["imu"]}))
-    diagnosis = diagnose(runs, world.simulation)
+    world = worlds("husky")
+
+    def diagnosed(ratio):
+        runs = []
+        for run in world.runs({"gyro_scale_ratio": ratio}):
+            wheels = run.streams["wheels"]
+            speeds = Stream(wheels.time_s, wheels.values[:, :2], wheels.channels[:2])
+            runs.append(replace(run, streams={"wheels": speeds, "imu": run.streams["imu"]}))
+        return diagnose(runs, world.simulation)
+
+    diagnosis = diagnosed(0.065)
     assert (diagnosis.verdict, named(diagnosis)) == (Tier.SET, [])
     assert {"gyro_scale", "effective_track"} <= set(diagnosis.ambiguous_sets[0])
     values = {v.name: v.value for values in diagnosis.ambiguous_values.values() for v in values}
-    assert values["gyro_scale_ratio"] == pytest.approx(0.1, abs=0.01)
-    assert 1 / (1 + values["effective_track_ratio"]) == pytest.approx(1.1, abs=0.02)
+    assert values["gyro_scale_ratio"] == pytest.approx(0.065, abs=0.01)
+    assert 1 / (1 + values["effective_track_ratio"]) == pytest.approx(1.065, abs=0.02)
     assert HEADING in diagnosis.next_drive.reason
+    # no gyro is 12 % off
+    assert named(diagnosed(0.12)) == ["effective_track"]
 
 
 def test_inputs_of_a_tilt_that_is_no_slope_are_no_evidence(worlds, monkeypatch):

@@ -242,6 +242,10 @@ def test_a_turning_robot_slips_to_the_outside_of_the_turn_and_slows_down():
     wide = {"effective_track_ratio": 2.0, "turn_drag_s2": 0.9, "turn_side_slip_s": 0.2}
     shown, slow = speeds(skid(HUSKY, 0.5, 0.9), wide), 0.5 / (1 + 0.9 * 0.3**2)
     assert [shown[SPEED_X][-1], shown[SPEED_Y][-1]] == pytest.approx([slow, -0.2 * slow * 0.3])
+    # slip along the ground takes speed and nothing else
+    before, after = (speeds(skid(HUSKY, 0.5, 0.9), {"ground_slip_ratio": slip}) for slip in (0.0, 0.2))
+    assert after[SPEED_X][-1] == pytest.approx(0.8 * before[SPEED_X][-1])
+    np.testing.assert_array_equal(after[GYRO], before[GYRO])
     # no drag turns the motion about
     assert (speeds(skid(HUSKY, 0.5, 4.0), {"turn_drag_s2": 3.0})[SPEED_X] > 0).all()
 
