@@ -411,7 +411,7 @@ def _withdraw_wrong(problem: Problem, fit: CauseFit, withdrawn: dict[str, verdic
 def _without_implausible(
     problem: Problem, fit: CauseFit, cause: Effect, reason: str, withdrawn: dict[str, verdict.Cause]
 ) -> CauseFit:
-    """Withdraw a cause of a size that nobody would believe; other effects take its place if they fit as well."""
+    """Withdraw a cause of a size that is not plausible; other effects take its place if they fit as well."""
     left = _withdraw(problem, fit, cause, reason, withdrawn)
     more = search_on(problem._replace(barred=frozenset(withdrawn)), left.info, left.causes)
     with_it, without = (fit_again(problem, fit.info, names_of(each.causes))[0] for each in (fit, more))
