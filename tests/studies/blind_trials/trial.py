@@ -38,6 +38,7 @@ from terrain.effects import (
     GYRO,
     HEADING,
     LIBRARY,
+    PARAMETER,
     SKIDDING,
     SPEED_X,
     SPEED_Y,
@@ -96,7 +97,7 @@ ROBOTS_OF_ROW = {
 SHORT_RUNS = 80  #: number of runs where a run is one command of 6 s
 
 STRONG = 3.0  #: amplitude over the detection limit, of an effect that has to be named
-CLIP_RATIO = 0.9  #: ratio of the bounds of an effect, beyond which none is hidden
+CLIP_RATIO = 0.9  #: ratio of the plausible range of an effect, beyond which none is hidden
 LADDER, FOUND_LADDER = (0.1, 10.0), (0.5, 6.5)  #: ranges of amplitudes over the limit, in these rows
 OUTSIDE = ("wheel_eccentricity", "motor_drift", "stick_slip", "clock_rate")
 """Hidden in row ``outside``: two effects that no library has, and two whose entry is taken out."""
@@ -145,8 +146,8 @@ def log_uniform(rng: np.random.Generator, ends: tuple[float, float]) -> float:
 
 
 def values_of(effect: Effect, limits: Limits, over: float, rng: np.random.Generator) -> dict[str, float]:
-    """Return values of an effect, of an amplitude over its limit, in a random direction within its bounds."""
-    low, high = (np.array(ends) for ends in zip(*((p.low, p.high) for p in effect.parameters), strict=True))
+    """Return values of an effect, of an amplitude over its limit, in a random direction within its plausible range."""
+    low, high = (np.array(ends) for ends in zip(*(p.plausible for p in effect.parameters), strict=True))
     direction = rng.standard_normal(len(effect.parameters))
     direction /= np.linalg.norm(direction)
     direction = np.where((low == 0.0) & (direction < 0), -direction, direction)
@@ -160,11 +161,11 @@ def is_clipped(values: Mapping[str, float]) -> bool:
 
     Examples
     --------
-    >>> is_clipped({"gyro_scale_ratio": 0.135}), is_clipped({"gyro_scale_ratio": 0.13})
+    >>> is_clipped({"gyro_scale_ratio": 0.9 * 0.05}), is_clipped({"gyro_scale_ratio": 0.04})
     (True, False)
     """
     return any(
-        value != 0.0 and value in [CLIP_RATIO * bound for bound in BOUNDS[name]]
+        value != 0.0 and value in [CLIP_RATIO * end for end in PARAMETER[name].plausible]
         for name, value in values.items()
     )
 
@@ -681,7 +682,7 @@ class Draw(NamedTuple):
     def strong(
         self, limits: Limits, over_limit: tuple[float, float] = CLEAR, without: Sequence[str] = ()
     ) -> Hidden:
-        """Draw an effect that these drives excite: its amplitude is within its bounds."""
+        """Draw an effect that these drives excite: its amplitude is plausible."""
         over = log_uniform(self.rng, over_limit)
         fit = [e for e in self.library if e.name not in without and e.parameters[0].name in limits.names]
         for i in self.rng.permutation(len(fit)):
@@ -747,14 +748,14 @@ def _with_known_scatter(draw: Draw) -> Stage:
 
 
 def _of_drive(draw: Draw) -> Stage:
-    """Rows of robots whose logs have no currents: effects in turn of 3 times their limit, within their bounds."""
+    """Rows of robots whose logs have no currents: effects in turn of 3 times their limit, of a plausible size."""
     robot, rng, library = draw.robot, draw.rng, draw.library
     drives = car_drives(rng, robot, draw.case.n_runs) if isinstance(robot, BicycleRobot) else draw.rich()
     turn = draw.case.number // len(ROBOTS_OF_ROW[draw.case.row])
     if turn % NOTHING_EVERY == NOTHING_EVERY - 1:
         return Stage(draw.runs(drives, {}), Hidden(library), None)
     limits = limits_of(robot, drives)
-    most = {effect: CLIP_RATIO * min(p.high for p in effect.parameters) for effect in library}
+    most = {effect: CLIP_RATIO * min(p.plausible[1] for p in effect.parameters) for effect in library}
     shown = [effect for effect in library if STRONG * limits.of(effect) < most[effect]]
     effect = shown[(turn - turn // NOTHING_EVERY) % len(shown)]
     while is_clipped(values := values_of(effect, limits, STRONG, rng)):
