@@ -86,12 +86,13 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
         ),
         n_pictures=None if settings.pictures == "all" else int(settings.pictures),
         page=out / PAGE_FILE,
-        extended_file=extended_file if found.diagnosis.built_in else None,
+        extended_file=extended_file if found.is_extended else None,
     )
     if result.extended_file is not None:
         effects = extended_effects(tested, result.diagnosis)
-        sources = sources_of(result.diagnosis, settings.dataset or "a data set")
-        atomic_write(extended_file, extended_yaml(description, *effects, sources, result.extended.region))
+        sources, about = sources_of(result.diagnosis, settings.dataset or "a data set"), result.extended
+        text = extended_yaml(description, *effects, sources, about.region, about.learned)
+        atomic_write(extended_file, text)
     if (drive := result.diagnosis.next_drive) is None:
         (out / NEXT_FILE).unlink(missing_ok=True)  # of an earlier result
     else:
@@ -157,15 +158,18 @@ def explain(
     gained = held_out_gain(diagnosed, robot, seed)
     progress("gain", 1, 1)
     diagnosis, extended = diagnosed.diagnosis, robot
-    if diagnosed.extended is not None:
-        if asked.classifier and diagnosed.held_out:
-            from pipelines.explain.classifier import classifier_gain
+    if diagnosed.extended is not None and asked.classifier and diagnosed.held_out:
+        from pipelines.explain.classifier import classifier_gain
 
-            before, after = diagnosed.simulation.effects, diagnosed.extended.effects
-            compared = classifier_gain(diagnosed.held_out, robot, before, after, seed, progress=progress)
-            gained = replace(gained, comparisons={**gained.comparisons, "classifier": compared})
+        before, after = diagnosed.simulation.effects, diagnosed.extended.effects
+        compared = classifier_gain(diagnosed.held_out, robot, before, after, seed, progress=progress)
+        gained = replace(gained, comparisons={**gained.comparisons, "classifier": compared})
+    if diagnosed.with_terms is not diagnosed.simulation:
         values, cov, _ = extended_effects(robot, diagnosis)
+        source = f"terrain explain, {diagnosis.n_runs} runs of {data or 'a data set'}"
+        terms = [replace(term, source=source) for term in diagnosed.with_terms.learned[len(robot.learned) :]]
         extended = replace(robot, effects=values, effects_cov=cov, region=region_of(diagnosed.fit, robot))
+        extended = replace(extended, learned=(*robot.learned, *terms))
     return ExplainResult.of(
         asked,
         data=data,

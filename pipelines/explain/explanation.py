@@ -13,6 +13,7 @@ from pipelines.explain.statements import (
     effect_label,
     gain_text,
     in_words_of,
+    learned_texts,
     varying_text,
     verdict_text,
     would_have_shown,
@@ -51,7 +52,8 @@ class ExplainResult(Result, eq=False):
     """What the simulation of a robot gets wrong about runs, and what building that in gains.
 
     In JSON the fields of the diagnosis stand beside the others.  ``robot`` is that which was tested, ``extended``
-    the same with the causes built in, where any was named; ``n_pictures`` runs are drawn at the most, None for all.
+    the same with what was named and learned built in, if anything; ``n_pictures`` runs are drawn at the most, None
+    for all.
     """
 
     robot: Robot
@@ -80,16 +82,24 @@ class ExplainResult(Result, eq=False):
         """What the simulation gets wrong, with its evidence."""
         return self.diagnosed.diagnosis
 
+    @property
+    def is_extended(self) -> bool:
+        """Whether anything that was named or learned is built in."""
+        return bool(self.diagnosis.built_in) or self.extended.learned != self.robot.learned
+
     def as_json(self) -> dict[str, Any]:
         """Return the described fields, those of the diagnosis, and what the runs were used for."""
-        runs, extended = self.diagnosed, {"file": self.extended_file, "effects": self.extended.effects}
+        runs, terms = self.diagnosed, self.extended.learned
+        learned = [{"channel": term.channel, "says": term.says} for term in terms]
+        extended = {"file": self.extended_file, "effects": self.extended.effects, "learned": learned}
         beside = {
             **as_json(self.diagnosis),
             "built_in": runs.simulation.effects,
             "terrain_matches": runs.terrains,
             "used": [run.run_id for run in runs.used],
             "held_out": [run.run_id for run in runs.held_out],
-            "extended": extended if self.diagnosis.built_in else None,
+            "extended": extended if self.is_extended else None,
+            "learned": runs.learned_gains,
         }
         return {**as_json(beside), **super().as_json()}
 
@@ -121,7 +131,9 @@ def report(result: ExplainResult) -> Report:
         picture = figures.run_figure(stretch, runs.noise, (stated or there)[:PICTURED])
     written = Report(
         title=f"What the simulation of {diagnosis.robot} gets wrong",
-        answer=f"{verdict_text(diagnosis)} {gain_text(result.gain.gain)}",
+        answer=" ".join(
+            [verdict_text(diagnosis), gain_text(result.gain.gain), *learned_texts(runs.learned_gains)]
+        ),
         picture=picture,
         parts=[*_decisive_parts(result)],
         details=[section for section in _details(result) if section.parts],
@@ -166,8 +178,9 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
         yield _rivals(names, diagnosis)
     for each in diagnosis.varying:
         yield Text(varying_text(each))
+    yield from _learned_parts(result.diagnosed)
     if (before := result.gain.built_in_before) is not None:
-        yield Text(f"Effects that the description has already: {gain_text(before)}")
+        yield Text(f"What the description has already: {gain_text(before)}")
     if n := len(diagnosis.not_shown):
         of = len(diagnosis.detection_limits)
         yield Text(f"Of {of} parameters that may be wrong, {n} could not have been detected.")
@@ -177,6 +190,28 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
         yield Text(skipped, "warning")
     if result.extended_file is not None:
         yield Pairs([("extended robot", str(result.extended_file))])
+
+
+def _learned_parts(diagnosed: DiagnosedRuns) -> Iterator[Part]:
+    """Yield what acts without a name, with its gain on the runs held out, or in cross-validation without any."""
+    judged = {gain.channel: gain for gain in diagnosed.learned_gains}
+    rows: list[tuple[Any, ...]] = []
+    for channel, each in diagnosed.learned.items():
+        if each.term is None:
+            continue
+        cells: tuple[Any, ...] = (None, None, each.inner_gain, each.reference_gain, "cross-validated")
+        if (gain := judged.get(channel)) is not None:
+            remark = "" if gain.is_kept else "worse on held-out runs, left out"
+            cells = gain.named_reduction, gain.ci, gain.reduction, gain.learner_reduction, remark
+        rows.append((CHANNEL_WORDS[channel][0], each.term.says, *cells))
+    if rows:
+        numbers = "square less by names", "the term adds, 95 %", "with the term", "by the learner"
+        heads = Column("no name fits in", long=True), Column("a learned term", long=True)
+        note = (
+            "Sums of products of speed and turn, selected by cross-validation on what the names leave; "
+            "outside the speeds and turns that were driven they are off."
+        )
+        yield Table((*heads, *[Column(name, PERCENT) for name in numbers], ""), rows, note=note)
 
 
 def _rivals(names: Sequence[str], diagnosis: Diagnosis) -> Table:

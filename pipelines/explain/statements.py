@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from pipelines.report.numbers import enumerated
 from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, Slope, off_by, slopes_of
 from terrain.discrepancy.gain import Gain
+from terrain.discrepancy.learner import LearnedGain
 from terrain.discrepancy.patterns import Kind
 from terrain.discrepancy.robot_terms import UNITS, in_robot_terms, quantity, values_with_intervals
 from terrain.discrepancy.runs import TerrainMatch
@@ -218,6 +219,28 @@ def gain_text(gain: Gain) -> str:
     part = f"{percent_text(gain.reduction)} ({percent_text(gain.ci[0], '')} to {percent_text(gain.ci[1])})"
     refused = ", which may be nothing" if gain.refused else ""
     return f"Judged on {gain.how}, the extension removes {part} of the square{refused}, {learner}."
+
+
+def learned_texts(gains: Sequence[LearnedGain]) -> list[str]:
+    """Return a sentence on each learned term that is built in.
+
+    Examples
+    --------
+    >>> gain = LearnedGain("speed_x_mps", "speed lost in turns", 0.1, 0.81, (0.74, 0.88), 0.83, True)
+    >>> (text,) = learned_texts([gain, gain._replace(is_kept=False)])
+    >>> text.replace(NBSP, " ")
+    'No name fits "speed lost in turns": a learned term of it removes 81 % of the square of speed ahead, names 10 %.'
+    """
+    texts = []
+    for gain in gains:
+        if gain.is_kept:
+            both, named = percent_text(gain.reduction), percent_text(gain.named_reduction)
+            of = CHANNEL_WORDS[gain.channel][0]
+            texts.append(
+                f'No name fits "{gain.says}": a learned term of it removes {both} of the square of {of}, '
+                f"names {named}."
+            )
+    return texts
 
 
 def sources_of(diagnosis: Diagnosis, data: str) -> dict[str, str]:

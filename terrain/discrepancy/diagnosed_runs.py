@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from terrain.discrepancy.compared import ComparedRun, compare_runs, without_levels
+from terrain.discrepancy.compared import ComparedRun, beside_extended, compare_runs, without_levels
 from terrain.discrepancy.constancy import PartValues, part_values
 from terrain.discrepancy.diagnose import check_ids, find_causes, judged, statement_of
 from terrain.discrepancy.earned import MIN_RUNS, crossed_runs, held_out_runs
 from terrain.discrepancy.gain import Gain
 from terrain.discrepancy.grounds import simulation_for
 from terrain.discrepancy.held_out import Comparison, filter_gain, repair_held_out, split_runs
+from terrain.discrepancy.learner import Learned, LearnedGain, kept_terms, learn_terms, learned_gains
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.runs import (
     LowPass,
@@ -52,6 +53,9 @@ class DiagnosedRuns:
     low_pass: LowPass
     parts: tuple[PartValues, ...]  #: values of the causes in parts of the data
     acting: Mapping[str, Sequence[str]]  #: by cause, the channels where it acts, on the runs judged
+    learned: Mapping[str, Learned]  #: by channel, what was learned beside what was named
+    learned_gains: tuple[LearnedGain, ...]  #: of each learned term; empty where no run was held out
+    with_terms: Simulation  #: with what was named and learned built in
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +112,17 @@ def diagnose_runs(
     diagnosis = statement_of(found, judgement)
     extended = found.extended if diagnosis.built_in else None
     compared = compare_runs(simulation, extended, problem.signals, problem.low_pass)
-    info = problem.at((extended or simulation).vector)
+    last = extended or simulation
+    info = problem.at(last.vector)
+    noise = without_levels(info.noise, compared)
+    learned = learn_terms(last, problem.signals, compared, problem.low_pass, noise, seed)
+    gains: tuple[LearnedGain, ...] = ()
+    with_terms = last.with_learned(kept_terms(learned))
+    if with_terms is not last and not on.in_turn:
+        pairs = zip(on.plain, on.signals, strict=True)
+        both = [beside_extended(run, own, with_terms, problem.low_pass) for run, own in pairs]
+        gains = learned_gains(learned, judgement.runs, on.gain(both), both, seed)
+        with_terms = last.with_learned(kept_terms(learned, gains))
     behind = {run.run_id for run in problem.signals}
     return DiagnosedRuns(
         diagnosis=diagnosis,
@@ -121,19 +135,22 @@ def diagnose_runs(
         held_out=tuple(held_out),
         compared=compared,
         judged=judgement.runs,
-        noise=without_levels(info.noise, compared),
+        noise=noise,
         low_pass=problem.low_pass,
         parts=part_values(info, diagnosis.built_in),
         acting=judgement.acting,
+        learned=learned,
+        learned_gains=gains,
+        with_terms=with_terms,
     )
 
 
 def held_out_gain(diagnosed: DiagnosedRuns, robot: Robot, seed: int) -> HeldOutGain:
     """Return what the extension gains, for a filter too, and what the effects gain that the robot had already."""
     diagnosis, comparisons = diagnosed.diagnosis, {}
-    if diagnosed.extended is not None and diagnosed.held_out:
+    extended = diagnosed.with_terms
+    if extended is not diagnosed.simulation and diagnosed.held_out:
         # a filter is given the logs as they are: with a fault in them its error is that of the fault
-        extended = diagnosed.extended
         comparisons["filter"] = (
             None if diagnosis.faults else filter_gain(diagnosed.held_out, robot, extended, seed)
         )
@@ -142,14 +159,14 @@ def held_out_gain(diagnosed: DiagnosedRuns, robot: Robot, seed: int) -> HeldOutG
 
 
 def gain_built_in(diagnosed: DiagnosedRuns, seed: int) -> Gain | None:
-    """Return what the effects that a simulation has already gain on all runs, over the same without; None without.
+    """Return what effects and terms that a simulation has already gain on all runs, over it without; None without any.
 
     None of the runs was used to find them, as far as is known.
     """
     simulation = diagnosed.simulation
-    if not simulation.effects:
+    if not simulation.effects and not simulation.learned:
         return None
-    bare = replace(simulation, effects={})
+    bare = replace(simulation, effects={}, learned=())
     signals, low_pass = diagnosed.signals, diagnosed.low_pass
     on = crossed_runs(
         signals,
@@ -158,7 +175,8 @@ def gain_built_in(diagnosed: DiagnosedRuns, seed: int) -> Gain | None:
         {name: of.noise for name, of in diagnosed.diagnosis.residual_before.items()},
         seed,
     )
-    runs = on.beside([simulation.effects] * len(on.left_out))
+    pairs = zip(on.plain, on.signals, strict=True)
+    runs = [beside_extended(run, own, simulation, low_pass) for run, own in pairs]
     return on._replace(how=f"{len(runs)} runs, none of which was used to find it").gain(runs)
 
 

@@ -131,6 +131,7 @@ def filter_gain(runs: Sequence[RunLog], robot: Robot, extended: Simulation, seed
     if name is None or not known:
         return None
     better = replace(robot, effects=dict(extended.effects), effects_cov=np.empty((0, 0)))
+    better = replace(better, learned=extended.learned)
     try:
         rows = [[_errors(estimate_run(run, one, name)) for one in (robot, better)] for run in known]
     except TerrainError as error:

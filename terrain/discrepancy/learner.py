@@ -25,6 +25,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from terrain.discrepancy.compared import ComparedRun
+from terrain.discrepancy.gain import Gain, Interval, removed_by
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.runs import (
     LowPass,
@@ -35,6 +36,7 @@ from terrain.discrepancy.runs import (
     term_inputs,
     term_rows,
 )
+from terrain.discrepancy.verdict import Covariance
 from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
 from terrain.learned_term import (
     INPUTS,
@@ -142,7 +144,6 @@ def learn_terms(
     compared: Sequence[ComparedRun],
     low_pass: LowPass,
     noise: Noise,
-    source: str = "learned",
     seed: int = 0,
 ) -> dict[str, Learned]:
     """Return by channel what was learned on runs; of channels that none of them measured nothing.
@@ -151,7 +152,6 @@ def learn_terms(
     ----------
     simulation : with all named causes built in, and what was learned before
     signals, compared : of the runs, faults repaired; and the same beside the simulation before the causes
-    source : of the terms, in words
     seed : of the groups of the cross-validation, where runs are not of several sessions
     """
     by_id = {run.run_id: run for run in compared}
@@ -187,7 +187,7 @@ def learn_terms(
             continue
         errors = cross_validated(sums)
         reference = _reference_error(compared, groups, c)
-        n = _size(errors, (1.0 - ENOUGH) * before + ENOUGH * reference)
+        n = size_of(errors, (1.0 - ENOUGH) * before + ENOUGH * reference)
         of_noise = np.concatenate([noise.size(run.pace_mps)[:, c] for run in compared]) ** 2
         left_std = math.sqrt(max(float(errors[:, n].sum()) / n_rows - float(np.nanmean(of_noise)), 0.0))
         term = None
@@ -197,14 +197,101 @@ def learn_terms(
             coefficients, covariance = fitted(sums, chosen)
             names = tuple(products[i] for i in chosen)
             used = region_of_term(names, ranges)
-            term = LearnedTerm(channel, names, coefficients, covariance, used, left_std, "learned", source)
+            term = LearnedTerm(channel, names, coefficients, covariance, used, left_std)
             added = [term.predict(inputs, np.full(len(inputs), dt))[0] for dt, inputs in steps_inputs]
             says = where_it_acts(channel, names, np.concatenate(added), every)
-            term = LearnedTerm(channel, names, coefficients, covariance, used, left_std, says, source)
+            term = LearnedTerm(channel, names, coefficients, covariance, used, left_std, says)
             simulation = simulation.with_learned([term])
         inner_gain, reference_gain = (1.0 - np.array([errors[:, n].sum(), reference]) / before).tolist()
-        learned[channel] = Learned(term, inner_gain, reference_gain, left_std)
+        learned[shown] = Learned(term, inner_gain, reference_gain, left_std)
     return learned
+
+
+def replay_std(
+    run: Signals,
+    simulation: Simulation,
+    low_pass: LowPass,
+    noise: Noise,
+    covariance: Covariance,
+    learned: Mapping[str, Learned],
+) -> Array:
+    """Return the standard deviation (m, channels) of measured minus simulated, row by row.
+
+    It is that of the noise at the speed of the wheels, of the parameters, of the coefficients of learned terms, and of
+    what these leave beside the noise.
+
+    Parameters
+    ----------
+    simulation : with causes and terms built in
+    covariance : of the parameters of the causes
+    learned : by channel
+    """
+    about = simulation.planar_on(run.terrain), simulation.vector, covariance.parameters, low_pass
+    rows = rows_of(run, *about)
+    change = rows.sensitivity
+    variance = noise.size(rows.pace_mps) ** 2 + np.einsum("pmc,pq,qmc->mc", change, covariance.matrix, change)
+    dt, inputs = term_inputs(run, simulation, low_pass)
+    for shown, each in learned.items():
+        variance[:, CHANNELS.index(shown)] += each.left_std**2
+        if each.term is None:
+            continue
+        columns = each.term.columns(inputs, np.full(len(inputs), dt))
+        for channel in {shown, GYRO} if each.term.channel == HEADING else {shown}:
+            seen = term_rows(run, simulation, low_pass, channel, each.term.channel, columns)
+            own = np.einsum("mk,kl,ml->m", seen, each.term.covariance, seen)
+            variance[:, CHANNELS.index(channel)] += np.maximum(own, 0.0)
+    return np.asarray(np.sqrt(variance))
+
+
+def kept_terms(learned: Mapping[str, Learned], gains: Sequence[LearnedGain] = ()) -> tuple[LearnedTerm, ...]:
+    """Return the terms that are built into an extended robot.
+
+    Where no run was held out, cross-validation alone decides.
+    """
+    worse = {gain.channel for gain in gains if not gain.is_kept}
+    terms = [each.term for name, each in learned.items() if name not in worse]
+    return tuple([term for term in terms if term is not None])
+
+
+class LearnedGain(NamedTuple):
+    """What a learned term gains on runs held out, as parts of the square of its channel before."""
+
+    channel: str
+    says: str  #: where the term acts, in words
+    named_reduction: float  #: that what is built in beside it removes; 0 where nothing is
+    reduction: float  #: that both remove
+    ci: Interval  #: 95 % interval of what the term adds to that
+    learner_reduction: float  #: that the black-box learner removes
+    is_kept: (
+        bool  #: whether it is built into the extended robot: a term that makes held-out runs worse is not
+    )
+
+
+def learned_gains(
+    learned: Mapping[str, Learned],
+    named: Sequence[ComparedRun],
+    both: Gain,
+    runs: Sequence[ComparedRun],
+    seed: int,
+) -> tuple[LearnedGain, ...]:
+    """Return the gain of each term on runs held out.
+
+    Parameters
+    ----------
+    named : the runs beside what was named alone, if anything
+    both, runs : gain with the terms, and the runs beside both
+    seed : of the bootstrap
+    """
+    gains, others = [], [run if run.after is not None else run._replace(after=run.before) for run in named]
+    removed = removed_by(runs, others, np.ones(len(CHANNELS)))
+    for shown, each in learned.items():
+        if each.term is None or shown not in both.channels:
+            continue
+        added, ci = removed.gain(np.array([name == shown for name in CHANNELS], dtype=float), seed)
+        of = both.channels[shown]
+        about = of.reduction - added, of.reduction, ci, of.learner_reduction
+        gains.append(LearnedGain(shown, each.term.says, *about, added > 0.0))
+    return tuple(gains)
 
 
 def groups_of(runs: Sequence[Signals], seed: int) -> Array:
@@ -339,7 +426,7 @@ def cross_validated(sums: Array) -> Array:
     return errors
 
 
-def _size(errors: Array, enough: float) -> int:
+def size_of(errors: Array, enough: float) -> int:
     """Return how many products a term has, by errors (groups, sizes) of the cross-validation."""
     total, freedom = errors.sum(axis=0), len(errors) - 1
     best = int(np.argmin(total))

@@ -108,7 +108,7 @@ class Simulation:
 
     def with_learned(self, terms: Sequence[LearnedTerm]) -> Simulation:
         """Return the same with learned terms added to those that are built in already."""
-        return replace(self, learned=(*self.learned, *terms))
+        return replace(self, learned=(*self.learned, *terms)) if terms else self
 
     def with_effects(self, values: Mapping[str, float]) -> Simulation:
         """Return the same with effects added to those that are built in already."""

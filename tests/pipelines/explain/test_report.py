@@ -116,7 +116,7 @@ LEFT = (
         (
             {"gain": replace(a_gain(), built_in_before=a_gain().gain)},
             (
-                "Effects that the description has already: Judged on 2 runs held out, the extension removes 50 %",
+                "What the description has already: Judged on 2 runs held out, the extension removes 50 %",
             ),
         ),
         (

@@ -1,15 +1,21 @@
 """What a learner reaches where no name fits, and what of it goes into the extended robot."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from pipelines.explain.explain import explain
 from pipelines.report.results import as_json
 from terrain.discrepancy.compared import ComparedRun
 from terrain.discrepancy.gain import gain_of
-from terrain.discrepancy.learner import DRIVEN, predicted_residuals
+from terrain.discrepancy.learner import DRIVEN, cross_validated, fitted, predicted_residuals, size_of
 from terrain.effects import CHANNELS
+from terrain.extension import extended_yaml
+from terrain.robots import load_robot
+from terrain.simulation.plants.planar import Ground
+from terrain.simulation.run import simulate
 
 # -- A black-box reference finds what depends on the inputs, no more than is there, beside the names -----------
 
@@ -58,3 +64,86 @@ def test_where_the_names_are_right_and_in_noise_little_is_left_and_one_run_has_n
     predicted = predicted_residuals([a_run(1)], [a_run(2)])
     assert np.isnan(np.delete(predicted[0], C, axis=1)).all()
     assert np.isnan(predicted_residuals([], [a_run(2)])[0]).all()
+
+
+# -- Terms: selected where they are, none in noise, with a covariance that holds the truth ---------------------------
+
+
+def sums_of(rng, truth, n_groups=10, n=60, level=0.0):
+    """Return sums of products by group: residuals of a group share a disturbance along the first product."""
+    tables = []
+    for _ in range(n_groups):
+        x = rng.standard_normal((n, len(truth)))
+        y = x @ truth + 0.5 * rng.standard_normal(n) + level * rng.standard_normal() * x[:, 0]
+        tables.append(np.column_stack([x, y]))
+    return np.array([table.T @ table for table in tables])
+
+
+def test_the_covariance_holds_the_truth_also_where_groups_differ():
+    truth, distances = np.array([0.5, -0.3, 0.2]), []
+    for seed in range(200):
+        sums = sums_of(np.random.default_rng(seed), truth, n_groups=20, level=0.2)
+        values, cov = fitted(sums, [0, 1, 2])
+        distances.append((values - truth) @ np.linalg.solve(cov, values - truth) / 3)
+    assert (
+        0.8 < np.median(distances) / 0.79 < 1.5
+    )  # chi-square over its 3 degrees; groups are few, so a little wide
+
+
+def test_the_fewest_products_that_do_are_selected_and_none_in_noise():
+    truth, sizes = np.zeros(12), []
+    truth[[3, 7]] = 0.5, -0.5
+    for seed in range(20):
+        errors = cross_validated(sums_of(np.random.default_rng(seed), truth))
+        sizes.append(size_of(errors, math.inf))
+    assert np.mean(np.array(sizes) == 2) > 0.8
+    nothing = [
+        size_of(cross_validated(sums_of(np.random.default_rng(s), 0.0 * truth)), math.inf) for s in range(50)
+    ]
+    assert np.mean(np.array(nothing) > 0) <= 0.08
+
+
+def test_a_residual_that_few_products_do_not_reach_gets_as_many_as_have_the_least_error():
+    errors = np.tile([10.0, 2.0, 1.0, 0.9], (8, 1)) + 0.3 * np.random.default_rng(0).standard_normal((8, 4))
+    errors[:, 3] = errors[:, 2] - 0.1 + 0.4 * np.resize([1.0, -1.0], 8)
+    assert (size_of(errors, math.inf), size_of(errors, 0.0)) == (2, 3)
+
+
+# -- A law that no name fits, from runs to a robot that moves by it -------------------------------------------------
+
+LOST, FROM_RADPS = 0.35, 0.2
+
+
+def lost_mps(speed, turn):
+    """The robot loses speed in turns to the left; written into the log, not by a term."""
+    return LOST * speed * np.maximum(turn - FROM_RADPS, 0.0)
+
+
+def with_loss(run, robot):
+    seen, wheels = run.streams["odometry"], run.streams["wheels"]
+    left, right = (np.interp(seen.time_s, wheels.time_s, wheels.values[:, i]) for i in (0, 1))
+    values = np.array(seen.values)
+    values[:, 0] -= lost_mps(0.5 * (left + right), (right - left) / robot.track_m)
+    return replace(run, streams={**run.streams, "odometry": replace(seen, values=values)})
+
+
+@pytest.mark.slow
+def test_a_law_outside_the_catalogue_comes_back_in_the_extended_robot_and_its_simulation(tmp_path, hide):
+    robot = load_robot("husky")
+    runs = [with_loss(run, robot) for run in hide({}, n=12)]
+    found = explain(runs, robot, effects=("effective_track", "wheel_radius"))
+    (gain,) = [each for each in found.diagnosed.learned_gains if each.channel == "speed_x_mps"]
+    assert gain.reduction > max(0.8, 0.9 * gain.learner_reduction)
+    assert "speed lost" in gain.says
+    assert "in turns to the left" in gain.says
+    assert gain.says in found.report.answer
+    effects = found.extended.effects, found.extended.effects_cov, {}
+    text = extended_yaml("husky", *effects, "a test", found.extended.region, found.extended.learned)
+    (tmp_path / "extended.yaml").write_text(text)
+    extended = load_robot(tmp_path / "extended.yaml")
+    time_s = np.arange(1500) / 50
+    twist = np.column_stack([0.6 + 0.2 * np.sin(0.3 * time_s), 0.0 * time_s, 0.45 * np.sin(0.5 * time_s)])
+    truth = [simulate(each, twist, Ground(), 0).streams["truth"] for each in (robot, extended)]
+    speed, less = (each.channel("speed_x_mps") for each in truth)
+    expected = lost_mps(speed, truth[0].channel("yaw_rate_radps"))
+    assert np.sqrt(np.mean((speed - less - expected)[100:] ** 2)) < 0.15 * np.sqrt(np.mean(expected**2))
