@@ -115,9 +115,7 @@ LEFT = (
         ({"gain": a_gain(refused=True)}, ("50 % (-20 to 60 %) of the square, which may be nothing",)),
         (
             {"gain": replace(a_gain(), built_in_before=a_gain().gain)},
-            (
-                "What the description has already: Judged on 2 runs held out, the extension removes 50 %",
-            ),
+            ("What the description has already: Judged on 2 runs held out, the extension removes 50 %",),
         ),
         (
             {"gain": a_gain(filter=FILTER, classifier=CLASSIFIER), "channels": (AHEAD,)},
