@@ -1,6 +1,6 @@
 """Scenes of MuJoCo: robots on wheels that touch the ground by its contacts, not by equations of this project.
 
-``pip install mujoco`` (the extra ``studies``).  A skid-steer robot on cylinders, a car-like one with an open
+``pip install mujoco`` (the extra ``studies``).  A skid-steer robot, a car-like one with an open
 differential and steered hinges, and one on three balls that are driven about one axis each and roll freely about the
 others, as omni wheels do.  Motors are velocity servos; encoders, gyro, accelerometer and speeds at the lidar are
 sensors of the scene, at mounts that may be elsewhere than the description says.  A slope is a gravity that leans.
@@ -23,6 +23,9 @@ WHEEL_KG, BALL_KG = 2.0, 0.2
 # at the most: beyond that a contact's friction lags behind the wheel.
 SERVO_NMSPR = {"skid": 20.0, "car": 400.0, "omni": 0.3}
 LEAST_INERTIA_KGM2 = {"skid": 0.05, "car": 0.5, "omni": 0.002}  #: of a motor, at the wheel
+# Times in which contacts give way across the ground and along it.  Along it they are soft: a contact that slides and is
+# stiff lifts itself off the ground, as a convex solver has it.
+NORMAL_S, CREEP_S = 0.02, 0.9
 MOTORS = "actuatorvel", "actuatorfrc"  #: sensors of each motor
 
 
@@ -59,11 +62,8 @@ def _wheel(k: int, body: Body, scene: Scene, kind: str, motor_inertia: float) ->
     x, y = body.wheels_m[k]
     radius = body.radius_m[k]
     steered = kind == "car" and k < 2
-    touch = (
-        f'<geom type="cylinder" size="{radius} 0.05" zaxis="0 1 0" mass="{WHEEL_KG}" class="tyre"/>'
-        if kind == "skid"
-        else f'<geom type="ellipsoid" size="{radius} {0.5 * radius} {radius}" mass="{WHEEL_KG}" class="tyre"/>'
-    )
+    size = f"{radius} {0.5 * radius} {radius}"
+    touch = f'<geom name="tyre{k}" type="ellipsoid" size="{size}" mass="{WHEEL_KG}"/>'
     play = f'<joint name="play{k}" axis="0 1 0" range="{-scene.play_rad} {scene.play_rad}" limited="true"/>'
     shaft = (
         f'<joint name="motor{k}" axis="0 1 0" armature="{motor_inertia}" frictionloss="{scene.bearing_nm}"/>'
@@ -91,7 +91,7 @@ def _ball(k: int, body: Body, scene: Scene, inertia: float) -> str:
     return (
         f'<body pos="{x} {y} 0"><joint name="ball{k}" type="ball" damping="{scene.roller_nms}"/>'
         f'<inertial pos="0 0 0" mass="{BALL_KG}" diaginertia="{inertia} {inertia} {inertia}"/>'
-        f'<geom type="sphere" size="{body.radius_m[k]}" class="tyre"/><site name="ball{k}"/></body>'
+        f'<geom type="sphere" size="{body.radius_m[k]}" name="tyre{k}"/><site name="ball{k}"/></body>'
     )
 
 
@@ -134,11 +134,16 @@ def model_of(kind: str, body: Body, scene: Scene, motor_inertia: float) -> Any:
     sensed = "".join(f'<{what} actuator="a{k}"/>' for what in MOTORS for k in range(len(servos))) + angles
     if kind == "car":
         servos += [f'<position joint="steer{k}" kp="400"/>' for k in (0, 1)]
+    mu = body.friction_ratio
+    pairs = "".join(
+        f'<pair geom1="ground" geom2="tyre{k}" condim="3" friction="{mu} {mu} 0 0 0" solref="{NORMAL_S} 1" '
+        f'solreffriction="{CREEP_S} 1"/>'
+        for k in wheels
+    )
     xml = f"""
-<mujoco><option timestep="{SCENE_STEP_S}" integrator="implicitfast" cone="elliptic" impratio="20"/>
-<default><default class="tyre">
-<geom friction="{body.friction_ratio} 0.005 0.0001" condim="3" solref="0.01 1"/></default></default>
-<worldbody><geom type="plane" size="0 0 1" friction="{body.friction_ratio} 0.005 0.0001"/>
+<mujoco><option timestep="{SCENE_STEP_S}" integrator="Euler" cone="elliptic"/>
+<default><geom contype="0" conaffinity="0"/></default><contact>{pairs}</contact>
+<worldbody><geom name="ground" type="plane" size="0 0 1"/>
 <body name="chassis" pos="0 0 {w}"><freejoint/>
 <inertial pos="{x} {y} {height}" mass="{own}" diaginertia="{0.5 * inertia} {0.6 * inertia} {0.8 * inertia}"/>
 <site name="imu" pos="{scene.imu_m[0]} {scene.imu_m[1]} 0" quat="{math.cos(pitch)} 0 {math.sin(pitch)} 0"/>
