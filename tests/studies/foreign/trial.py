@@ -125,9 +125,7 @@ def asked(runs: Sequence[RunLog], robot: Robot) -> tuple[Answer, Robot]:
     except DataError as error:
         return Answer(refusal=str(error)), robot
     diagnosis: Any = found.diagnosis
-    terms: Any = [
-        term for term in getattr(found.extended, "learned", ()) if term not in getattr(robot, "learned", ())
-    ]
+    terms = found.extended.learned[len(robot.learned) :]
     return Answer(
         named=diagnosis.values,
         causes=tuple(cause.name for cause in diagnosis.causes),
@@ -136,7 +134,7 @@ def asked(runs: Sequence[RunLog], robot: Robot) -> tuple[Answer, Robot]:
         faults=tuple(fault.sentence for fault in diagnosis.faults),
         candidates=tuple(cause.name for cause in diagnosis.candidates),
         unexplained=tuple(dict.fromkeys(left.channel for left in diagnosis.unexplained)),
-        learned=tuple(getattr(term, "channel", str(term)) for term in terms),
+        learned=tuple(term.channel for term in terms),
     ), found.extended
 
 
@@ -149,7 +147,7 @@ def examined(engine: str, name: str, seed: int) -> Examined:
     for child in np.random.SeedSequence(key).spawn(MAX_PASSES):
         runs = runs_of(world, driven_by(world, N_CALIBRATION, rng), child)
         answer, extended = asked(runs, robot)
-        if not answer.causes:
+        if extended.effects == robot.effects and len(extended.learned) == len(robot.learned):
             break
         robot = extended
     known = tuple(sorted({*answer.unexplained, *answer.learned, *answer.candidates}))
@@ -162,7 +160,7 @@ def examined(engine: str, name: str, seed: int) -> Examined:
 def evidence_of(runs: Sequence[RunLog], robot: Robot, noise: Noise | None = None) -> Evidence:
     """Return the evidence of runs beside a simulation; with noise that is known, of what differs by run alone."""
     signals = [signals_of(with_wheel_speeds(run, robot), robot) for run in runs]
-    simulation = Simulation(robot, Ground(), robot.effects, spread_numbers("scatter"))
+    simulation = Simulation(robot, Ground(), robot.effects, spread_numbers("scatter"), learned=robot.learned)
     names = names_of(library_of(robot.drive)) if noise is None else ()
     return evidence_at(signals, simulation, simulation.vector, names, low_pass_of(signals), noise)
 
