@@ -23,7 +23,7 @@ WHEEL_KG, BALL_KG = 2.0, 0.2
 # at the most: beyond that a contact's friction lags behind the wheel.
 SERVO_NMSPR = {"skid": 20.0, "car": 400.0, "omni": 0.3}
 LEAST_INERTIA_KGM2 = {"skid": 0.05, "car": 0.5, "omni": 0.002}  #: of a motor, at the wheel
-# Times in which contacts give way across the ground and along it.  Along it they are soft: a contact that slides and is
+# Times in which contacts yield normal to the ground and along it.  Along it they are soft: a contact that slides and is
 # stiff lifts itself off the ground, as a convex solver has it.
 NORMAL_S, CREEP_S = 0.02, 0.9
 MOTORS = "actuatorvel", "actuatorfrc"  #: sensors of each motor
