@@ -1,0 +1,134 @@
+"""A cause is named where it earns it on data that it was not fitted to; a set extends by one of its members."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from terrain.discrepancy.diagnose import diagnose
+from terrain.discrepancy.diagnosed_runs import diagnose_runs, held_out_gain
+from terrain.discrepancy.gain import earns
+from terrain.discrepancy.held_out import split_runs
+from terrain.discrepancy.verdict import Tier
+from terrain.effects import effect_named
+from terrain.records import Stream
+from terrain.robots import load_robot
+
+HUSKY = load_robot("husky")
+FEW = tuple(map(effect_named, ("camera_yaw", "lever_arm", "gyro_scale", "effective_track", "wheel_radius")))
+YAW = {"camera_yaw_rad": 0.05}
+
+
+def diagnosed(runs, hold_out=None, library=FEW, robot=HUSKY):
+    return diagnose_runs(runs, robot, library, hold_out, 0)
+
+
+def of_channel(diagnosis, name):
+    (verdict,) = [each for each in diagnosis.channels if each.channel == name]
+    return verdict
+
+
+@pytest.fixture(scope="module")
+def turned(hide):
+    """Return runs whose camera is turned."""
+    return hide(YAW, n=8, duration_s=20.0)
+
+
+def test_what_fits_the_runs_used_and_not_those_held_out_is_a_candidate_and_builds_nothing_in(hide, turned):
+    right = diagnosed(turned)
+    assert [cause.name for cause in right.diagnosis.causes] == ["camera_yaw"]
+    assert right.diagnosis.verdict is Tier.NAMED
+    _, held = split_runs(turned, None, 0)
+    ids = {run.run_id for run in held}
+    other = {run.run_id: run for run in hide({"camera_yaw_rad": -0.05}, n=8, duration_s=20.0)}
+    planted = [other[run.run_id] if run.run_id in ids else run for run in turned]
+    wrong = diagnosed(planted)
+    assert (wrong.diagnosis.causes, wrong.extended) == ((), None)
+    assert wrong.diagnosis.verdict is Tier.CANDIDATE
+    (candidate,) = [each for each in wrong.diagnosis.candidates if each.name == "camera_yaw"]
+    assert "on 2 runs held out: -" in candidate.reason
+    assert candidate.parameters[0].value == pytest.approx(0.05, abs=0.01)
+    assert of_channel(wrong.diagnosis, "speed_y_mps").tier is Tier.CANDIDATE
+
+
+def test_a_gyro_whose_axes_are_exchanged_names_nothing_that_does_not_help(turned):
+    """What the gyro measures has nothing to do with turning: the learner knows no better either."""
+    exchanged = []
+    for k, run in enumerate(turned):
+        imu = run.streams["imu"]
+        values = np.array(imu.values)
+        rng = np.random.default_rng(k)
+        place = imu.channels.index("gyro_z_radps")
+        values[:, place] = np.convolve(rng.standard_normal(len(values)), np.ones(25) / 5.0, "same") * 0.3
+        streams = {**run.streams, "imu": Stream(imu.time_s, values, imu.channels)}
+        exchanged.append(replace(run, streams=streams))
+    diagnosis = diagnosed(exchanged).diagnosis
+    for cause in diagnosis.built_in:
+        assert cause.gain_ci[0] > 0.0
+    gyro = of_channel(diagnosis, "yaw_rate_radps") if "yaw_rate_radps" in diagnosis.gain.channels else None
+    assert gyro is None or gyro.tier not in (Tier.NAMED, Tier.SET) or gyro.gain > 0.5 * gyro.learner_gain
+
+
+def test_a_set_extends_the_simulation_by_its_best_member_and_gains(hide):
+    """Without camera and heading a gyro's scale and an effective track are one and the same."""
+    runs = []
+    for run in hide({"gyro_scale_ratio": 0.1}, n=8, duration_s=20.0):
+        wheels = run.streams["wheels"]
+        speeds = Stream(wheels.time_s, wheels.values[:, :2], wheels.channels[:2])
+        runs.append(replace(run, streams={"wheels": speeds, "imu": run.streams["imu"]}))
+    found = diagnosed(runs)
+    diagnosis = found.diagnosis
+    assert (diagnosis.verdict, diagnosis.causes) == (Tier.SET, ())
+    assert {"gyro_scale", "effective_track"} <= set(diagnosis.ambiguous_sets[0])
+    (built,) = diagnosis.of_sets
+    assert built.tier is Tier.SET
+    assert built.name in diagnosis.ambiguous_sets[0]
+    assert found.extended.effects == pytest.approx(diagnosis.values)
+    assert diagnosis.covariance.parameters == tuple(diagnosis.values)
+    assert of_channel(diagnosis, "yaw_rate_radps").tier is Tier.SET
+    assert held_out_gain(found, HUSKY, 0).gain.ci[0] > 0.2
+
+
+def test_parts_of_few_runs_are_left_out_in_turn_and_what_was_built_in_gains_on_all(turned):
+    few = turned[:4]
+    by_parts = diagnose(few, diagnosed(few).simulation, FEW)
+    assert [cause.name for cause in by_parts.causes] == ["camera_yaw"]
+    assert by_parts.gain.how == "4 runs, runs of them left out of the fit in turn"
+    held = diagnosed(turned)
+    ahead, beside = (d.gain.channels["speed_y_mps"].reduction for d in (by_parts, held.diagnosis))
+    assert ahead == pytest.approx(beside, abs=0.1)
+    effects = dict(YAW)
+    extended = replace(HUSKY, effects=effects, effects_cov=np.array([[1e-6]]))
+    again = diagnosed(few, robot=extended)
+    assert (again.diagnosis.causes, again.extended) == ((), None)
+    gain = held_out_gain(again, extended, 0).built_in_before
+    assert len(gain.runs) == 4
+    assert gain.channels["speed_y_mps"].reduction == pytest.approx(ahead, abs=0.1)
+    assert held_out_gain(held, HUSKY, 0).built_in_before is None
+
+
+def test_sessions_are_held_out_and_a_run_that_cannot_be_compared_is_excluded_with_its_reason(turned):
+    runs = [replace(run, session=f"s{i % 4}") for i, run in enumerate(turned)]
+    short = {name: Stream(s.time_s[:5], s.values[:5], s.channels) for name, s in runs[3].streams.items()}
+    runs[3] = replace(runs[3], streams=short)
+    found = diagnosed(runs)
+    assert "of 1 session held out" in found.diagnosis.gain.how
+    assert {run.session for run in found.used}.isdisjoint(run.session for run in found.held_out)
+    (excluded,) = [run for run in found.diagnosis.excluded_runs if run.run_id == runs[3].run_id]
+    assert "at least 4 s are required" in excluded.reason
+    assert [cause.name for cause in found.diagnosis.causes] == ["camera_yaw"]
+
+
+@pytest.mark.parametrize(
+    ("reduction", "low", "learner", "in_turn", "expected"),
+    [
+        (0.5, 0.1, 0.9, False, True),
+        (0.4, 0.1, 0.9, False, False),  # under half of what the learner removes
+        (0.5, -0.1, 0.6, False, False),  # its interval holds 0
+        (0.5, -0.1, 0.6, True, True),
+        (-0.1, -0.2, -0.9, True, False),
+        (0.2, 0.1, -0.9, False, True),
+    ],
+)
+def test_a_gain_is_earned_above_0_and_by_half_of_the_learners(reduction, low, learner, in_turn, expected):
+    assert earns(reduction, (low, 1.0), learner, in_turn) is expected
