@@ -250,6 +250,7 @@ def judged(found: Found, on: HeldOut) -> tuple[Found, Judgement]:
         worst = min(doubtful, key=lambda cause: judgement.removed[cause.name][0])
         problem, withdrawn = found.problem, dict(found.withdrawn)
         fit = _withdraw(problem, found.fit, worst, judgement.reasons[worst.name], withdrawn)
+        fit = _withdraw_wrong(problem, fit, withdrawn)
         fit = pooled(problem, fit._replace(rivals=rivals_of(problem, fit.info, found.start, fit.causes)))
         found = found._replace(fit=fit, withdrawn=withdrawn)
 
