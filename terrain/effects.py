@@ -32,7 +32,7 @@ ones.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from enum import Enum
 from functools import partial
 from operator import attrgetter
@@ -43,6 +43,7 @@ import numpy as np
 import yaml
 
 from terrain.angles import unwrapped, wrapped
+from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.files.documents import check_keys, is_number, numbers
 from terrain.files.names import data_folder
@@ -233,6 +234,8 @@ FAST_RADPS, FAST_MPS = 1.0, 2.0  #: The same of what fast turns do.
 #: Yaw rate from which the wheels mostly slide sideways, and below which they mostly deflect; of a Warthog on asphalt
 #: and gravel.
 SLIDING_RADPS = 1.0
+#: Speed over which a resistance takes its full size: it opposes motion and does not push a robot at rest.
+RESTING_MPS = 0.05
 
 
 def rounded(value: float, half: float) -> str:
@@ -309,10 +312,20 @@ def _turn_drag(terms: Sequence[Term]) -> str:
 
 
 def _fast_turns(terms: Sequence[Term]) -> str:
-    x = terms[0].total * (FAST_MPS * FAST_RADPS) ** 2 / (1.0 + (FAST_RADPS / SLIDING_RADPS) ** 2)
+    by_speed, by_turn = (term.total for term in terms)
+    x = by_speed * (FAST_MPS * FAST_RADPS) ** 2 / (1.0 + (FAST_RADPS / SLIDING_RADPS) ** 2)
+    x += by_turn * FAST_RADPS / (SLIDING_RADPS + FAST_RADPS)
     gained = x / (1.0 + abs(x))
     percent = 100.0 * gained / (1.0 + gained)
-    return f"a track that acts {percent:.2g} % narrower at {FAST_MPS:g} m/s and {FAST_RADPS:g} rad/s"
+    change = "narrower" if percent > 0 else "wider"
+    return f"a track that acts {abs(percent):.2g} % {change} at {FAST_MPS:g} m/s and {FAST_RADPS:g} rad/s"
+
+
+def _turning_moment(terms: Sequence[Term]) -> str:
+    (term,) = terms
+    lever_nm = 0.5 * term.robot.track_m * term.robot.mass_kg * GRAVITY_MPS2
+    number = rounded(lever_nm * abs(term.total), lever_nm * term.half)
+    return f"a moment against turning in place {number} Nm {'larger' if term.total > 0 else 'smaller'}"
 
 
 def _understeer(terms: Sequence[Term]) -> str:
@@ -355,26 +368,107 @@ def _undo_yaw_delay(block: Block, delay_s: float) -> None:
     block.memory["yaw_delay"] = time_s[first:], seen[first:]
 
 
-def _undo_steering_backlash(block: Block, half_rad: float) -> None:
-    for channel in set(block.robot.steer_channels) & set(block.channels):
-        last_rad, follower = block.memory.get(channel, (math.nan, math.nan))
+def _steer(block: Block, name: str, follow: Callable[..., float]) -> None:
+    """Turn each steering angle to what follows it, by it, the one before, what followed that, its zero and the time."""
+    for channel, zero_rad in zip(block.robot.steer_channels, block.robot.steering_zeros_rad, strict=False):
+        if channel not in block.channels:
+            continue
+        last_rad, follower, last_s = block.memory.get(f"{name} {channel}", (math.nan,) * 3)
         column = block.channels.index(channel)
         angles = unwrapped(np.concatenate([[last_rad], block.values[:, column]]))[1:]
-        known = np.isfinite(angles)
+        known = np.isfinite(angles) & np.isfinite(block.time_s)
         for k in np.flatnonzero(known).tolist():
-            last_rad = float(angles[k])
+            angle_rad, at_s = float(angles[k]), float(block.time_s[k])
             if math.isnan(follower):
-                follower = last_rad
-            follower = min(max(follower, last_rad - half_rad), last_rad + half_rad)
+                last_rad, follower, last_s = angle_rad, angle_rad, at_s
+            follower = follow(angle_rad, last_rad, follower, zero_rad, max(at_s - last_s, 0.0))
+            last_rad, last_s = angle_rad, at_s
             block.values[k, column] = follower
-        block.memory[channel] = last_rad, follower
+        block.memory[f"{name} {channel}"] = last_rad, follower, last_s
         block.values[known, column] = wrapped(block.values[known, column])
 
 
+def _undo_steering_gain(block: Block, e: float) -> None:
+    _steer(block, "gain", lambda angle, before, last, zero, step_s: zero + (1.0 + e) * wrapped(angle - zero))
+
+
+def _undo_steering_dead_zone(block: Block, e: float) -> None:
+    def excess(angle: float, before: float, last: float, zero: float, step_s: float) -> float:
+        from_zero = float(wrapped(angle - zero))
+        return zero + math.copysign(max(abs(from_zero) - e, 0.0), from_zero)
+
+    _steer(block, "dead zone", excess)
+
+
+def _undo_steering_lag(block: Block, tau_s: float) -> None:
+    """Pass angles, straight from sample to sample, through the low-pass."""
+
+    def low_pass(angle: float, before: float, last: float, zero: float, step_s: float) -> float:
+        lead = tau_s * (angle - before) / step_s if step_s > 0.0 else 0.0
+        return angle - lead + math.exp(-step_s / tau_s) * (last - before + lead)
+
+    _steer(block, "lag", low_pass)
+
+
+def _undo_steering_backlash(block: Block, half_rad: float) -> None:
+    def played(angle: float, before: float, last: float, zero: float, step_s: float) -> float:
+        return min(max(last, angle - half_rad), angle + half_rad)
+
+    _steer(block, "backlash", played)
+
+
+def _wheel_columns(block: Block) -> Iterator[tuple[int, float]]:
+    """Yield the columns of wheel speeds and rates, and what a rate is times for a speed in m/s."""
+    for i, channel in enumerate(block.channels):
+        quantity, _, rest = channel.partition("_")
+        if quantity in ("motor", "speed", "wheel") and rest.rpartition("_")[0] in block.robot.logged_wheels:
+            radius_m = 1.0 if quantity == "speed" else block.robot.wheel_radius_m
+            yield i, radius_m / block.robot.motors.reduction_ratio if quantity == "motor" else radius_m
+
+
+def _undo_wheel_dead_zone(block: Block, dead_mps: float) -> None:
+    for i, factor in _wheel_columns(block):
+        speed = block.values[:, i]
+        speed += dead_mps / factor * (speed * factor) / np.hypot(speed * factor, RESTING_MPS)
+
+
+def _undo_drive_backlash(block: Block, half_rad: float) -> None:
+    """Pass the distance of each wheel through the play; its speed is that part of the motor's that it moves by."""
+    for i, factor in _wheel_columns(block):
+        half = half_rad * block.robot.wheel_radius_m / factor
+        name = f"play {block.stream} {block.channels[i]}"
+        last, last_s, ahead = block.memory.get(name, (math.nan, math.nan, 0.0))  # ahead: of the wheel
+        known = np.isfinite(block.values[:, i]) & np.isfinite(block.time_s)
+        for k in np.flatnonzero(known).tolist():
+            speed, time_s = float(block.values[k, i]), float(block.time_s[k])
+            step = 0.5 * (last + speed) * max(time_s - last_s, 0.0) if math.isfinite(last) else 0.0
+            now = min(max(ahead - step, -half), half)
+            if step != 0.0:
+                block.values[k, i] *= (step + (now - ahead)) / step
+            last, last_s, ahead = speed, time_s, now
+        block.memory[name] = last, last_s, ahead
+
+
+#: Part of the square below which a gyro's nonlinearity does not bend it: there it is at its end.
+GYRO_END = 0.1
+
+
+def bent_rate(rate_radps: Any, nonlinearity_s2: float) -> Any:
+    """Return what a nonlinear gyro reads of yaw rates, ``w / sqrt(1 + 2 k w^2)``; ``-k`` inverts it.
+
+    Examples
+    --------
+    >>> round(float(bent_rate(bent_rate(0.8, 0.1), -0.1)), 9), round(float(bent_rate(100.0, 0.5)), 3)
+    (0.8, 1.0)
+    """
+    return rate_radps / np.sqrt(np.maximum(1.0 + 2.0 * nonlinearity_s2 * rate_radps**2, GYRO_END))
+
+
 def _undo_gyro(block: Block, _: float) -> None:
-    """Take bias and scale off the gyro, and off the fused yaw, which is assumed to be the integral of both."""
+    """Take bias, scale and nonlinearity off the gyro, and off the fused yaw, assumed to be its integral."""
     effects = block.robot.effects
     bias, scale = effects.get("gyro_bias_radps", 0.0), 1.0 + effects.get("gyro_scale_ratio", 0.0)
+    bend = effects.get("gyro_nonlinearity_s2", 0.0)
     if "gyro_z_radps" in block.channels:
         gyro = block.values[:, block.channels.index("gyro_z_radps")]
         gyro -= block.applied.effects.get("gyro_bias_radps", 0.0)  # without a home
@@ -383,6 +477,9 @@ def _undo_gyro(block: Block, _: float) -> None:
             gyro -= described
             gyro /= scale
             gyro += described
+        if bend:
+            described = block.applied.completed.sensors.gyro_bias_z_radps
+            gyro[:] = bent_rate(gyro - described, -bend) + described
     if "yaw_rad" in block.channels:
         column = block.channels.index("yaw_rad")
         first_rad, last_rad = block.memory.get("yaw_rad", (math.nan, math.nan))
@@ -392,7 +489,16 @@ def _undo_gyro(block: Block, _: float) -> None:
             first_rad = float(yaw[known][0]) if math.isnan(first_rad) else first_rad
             block.memory["yaw_rad"] = first_rad, float(yaw[known][-1])
         turned_rad = yaw[known] - first_rad - bias * (block.time_s[known] - block.start_s)
-        block.values[known, column] = wrapped(first_rad + turned_rad / scale)
+        turned_rad /= scale
+        if bend and known.any():  # step by step, as it was summed up
+            was_rad, was_s, true_rad = block.memory.get("turned", (0.0, block.time_s[known][0], 0.0))
+            steps_s = np.diff(block.time_s[known], prepend=was_s)
+            steps_rad = np.diff(turned_rad, prepend=was_rad)
+            rates = np.divide(steps_rad, steps_s, out=np.zeros_like(steps_rad), where=steps_s > 0.0)
+            true = true_rad + np.cumsum(bent_rate(rates, -bend) * steps_s)
+            block.memory["turned"] = turned_rad[-1], block.time_s[known][-1], true[-1]
+            turned_rad = true
+        block.values[known, column] = wrapped(first_rad + turned_rad)
 
 
 CAMERA_VECTORS = (("position", "m"), ("quaternion", "ratio"), ("velocity", "mps"), ("rate", "radps"))
@@ -443,14 +549,15 @@ WORDS: dict[str, Callable[..., str]] = {
     function.__name__.removeprefix("_"): function
     for function in (
         *(_sided, _late, _track, _wheel_distance, _lever_arm),
-        *(_centre_of_mass, _turn_drag, _fast_turns, _understeer),
+        *(_centre_of_mass, _turn_drag, _fast_turns, _turning_moment, _understeer),
     )
 }
 UNDO: dict[str, Callable[[Block, float], None]] = {
     function.__name__.removeprefix("_undo_"): function
     for function in (
         *(_undo_one_sided_radius, _undo_yaw_delay, _undo_gyro),
-        *(_undo_steering_backlash, _undo_camera_yaw),
+        *(_undo_steering_gain, _undo_steering_lag, _undo_steering_backlash, _undo_steering_dead_zone),
+        *(_undo_wheel_dead_zone, _undo_drive_backlash, _undo_camera_yaw),
     )
 }
 ACT: dict[str, Callable[[Block, float], None]] = {
@@ -520,6 +627,8 @@ NUISANCES: tuple[str, ...] = tuple(
 SENSED_ONLY: tuple[str, ...] = tuple(
     p.name for effect in LIBRARY if effect.sensed_only for p in effect.parameters
 )
+#: By parameter, the channels in which it shows.
+SHOWS: dict[str, tuple[str, ...]] = {p.name: effect.channels for effect in LIBRARY for p in effect.parameters}
 #: Parameters whose sensitivity is taken towards the positive side only.
 ONE_SIDED: tuple[str, ...] = tuple(name for name, p in PARAMETER.items() if p.one_sided)
 #: Former names of parameters, and the present ones.
@@ -595,8 +704,8 @@ def nuisances_of(drive: str) -> tuple[str, ...]:
 
     Examples
     --------
-    >>> set(NUISANCES) - set(nuisances_of("swerve"))
-    {'effective_track_ratio'}
+    >>> sorted(set(NUISANCES) - set(nuisances_of("swerve")))
+    ['effective_track_ratio', 'turning_resistance_ratio']
     """
     own = {*parameters_of(drive), *(p.name for p in TILT_OFFSETS)}
     return tuple(name for name in NUISANCES if name in own)

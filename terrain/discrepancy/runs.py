@@ -30,6 +30,7 @@ from terrain.effects import (
     INDEX,
     ONE_SIDED,
     SENSED_ONLY,
+    SHOWS,
     SPEED_X,
     SPEED_Y,
     STEPS,
@@ -153,6 +154,8 @@ JUMP_S, JUMP_MPS, JUMP_SIGMAS = 0.05, 0.1, 8.0
 
 #: A wheel turns backward if it is faster than that on at least so many samples.
 BACKWARD_MPS, MIN_BACKWARD = 0.02, 5
+#: A run whose currents are not known in more than that ratio of its samples counts as one without.
+MOSTLY_BRAKED = 0.5
 #: Least norm of the mean of the wheels' unit vectors at which the sum of currents measures traction: wheels within 18
 #: degrees of each other.
 PARALLEL = 0.95
@@ -333,9 +336,15 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
         if robot.on_omni_wheels:
             currents = np.abs(currents)
         else:
+            unsigned = not np.nanmin(currents) < 0
             for current, speed in zip(currents.T, speeds.T, strict=False):
                 if (speed < -BACKWARD_MPS).sum() >= MIN_BACKWARD and not np.nanmin(current) < 0:
                     current *= np.sign(speed)
+            if unsigned and robot.skids:  # a wheel that turns with less than its friction takes is braked
+                least_a = robot.motors.friction_nm / robot.motors.nm_per_a
+                braked = (np.abs(speeds) > BACKWARD_MPS) & (np.abs(currents) < least_a)
+                mostly = braked.any(axis=1).mean() > MOSTLY_BRAKED
+                currents[braked if not mostly else slice(None)] = np.nan
         each = resampled(wheels.time_s, currents)
         measured[:, CHANNELS.index(CURRENT)] = np.sum(list(each.T), axis=0)
         parallel = np.abs(np.exp(1j * steer).mean(axis=1)) > PARALLEL
@@ -548,7 +557,11 @@ def rows_of(
     inputs = steer, grade, roll
     now = predicted(vector, wheel_speed, False)
     change = np.empty((len(parameters), *now.shape))
+    measuring = {CHANNELS[c] for c in np.flatnonzero(known.any(axis=0))}
     for j, name in enumerate(parameters):
+        if name in SHOWS and measuring.isdisjoint(SHOWS[name]):  # nothing measured shows it
+            change[j] = 0.0
+            continue
         i, (ahead, back) = INDEX[name], np.tile(vector, (2, 1))
         ahead[i] += STEPS[name]
         if name not in ONE_SIDED or vector[i] >= STEPS[name]:

@@ -22,7 +22,7 @@ import numpy as np
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects import on_samples
+from terrain.effects import bent_rate, on_samples
 from terrain.kernels import inner, njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import to_camera
@@ -309,8 +309,8 @@ def imu_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> tuple[
     It sits above the body's origin, at the height of the centre of mass.  The specific force is acceleration minus
     gravity: +g on z at rest, ``+g sin`` on x with the nose up.  Rates are those of the body: turning on an even slope
     shows no roll rate.  They are central differences of the attitude, so the latency is one step at least; in the first
-    row, which has no row before it, the rates of roll and pitch are 0.  Of the robot's effects it applies gyro_scale,
-    also to the fused yaw.
+    row, which has no row before it, the rates of roll and pitch are 0.  Of the robot's effects it applies gyro_scale
+    and gyro_nonlinearity, also to the fused yaw.
     """
     sensors, height_m, record = robot.sensors, robot.body.com_height_m, motion.record
     stamps = motion.at(sensors.imu_rate_hz, max(sensors.imu_latency_s, STEP_S))
@@ -322,9 +322,17 @@ def imu_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> tuple[
     def fill(first: int, out: Array) -> None:
         _rates_and_force(record, motion.up, first, height_m, out)
 
+    bend, lost_rad = robot.effects.get("gyro_nonlinearity_s2", 0.0), np.zeros(1)
+
     def write(new: slice, rows: Array, seen: Array) -> Array:
         at = record[rows]
         true = np.column_stack([seen, at["roll_rad"], at["pitch_rad"], at["yaw_rad"] - record["yaw_rad"][0]])
+        if bend and len(true):
+            lost = true[:, 2] - bent_rate(true[:, 2], bend)
+            true[:, 2] -= lost
+            summed = np.cumsum(np.concatenate([lost_rad, lost / sensors.imu_rate_hz]))
+            true[:, 8] -= summed[1:]
+            lost_rad[0] = summed[-1]
         return imu_values(true, scale, bias[new], noise[new])
 
     return Sensor(motion, IMU_CHANNELS, stamps, write, fill, lags_s, ahead=1), bias[:, 2]

@@ -3,8 +3,8 @@
 Effects of the robot (:mod:`terrain.effects`) act where a real robot would have them:
 
 - **wheel_radius, one_sided_radius**: true radii of the wheels, of which the commands know nothing;
-- **steering_delay, steering_backlash, steering_offset_i**: between the encoder, which the steering motor obeys, and the
-  wheel: ``wheel(t) = play(encoder(t - T)) + d0``;
+- **steering_delay, steering_gain, steering_lag, steering_backlash, steering_offset_i**: between the encoder, which the
+  steering motor obeys, and the wheel: ``wheel(t) = play(lag((1 + e) encoder(t - T))) + d0``;
 - **force_slip, shear_slip**: a creep of the contact on top of the ground's own slip.  Its deflection follows ``du/dt
   = (w r - v) - max(|w r|, |v|) (u / sigma + c f)`` with ``f = 3 F_i / W``, so that it settles where slip is that of
   the ground plus ``c f``, and no equation has to be solved for a force; of a shear curve ``c f`` is bent as in
@@ -140,7 +140,7 @@ WHEEL_STATE = record(
     numbers(
         "rate_radps angle_rad steer_rad steer_motor_rad steer_motor_radps deflection_x_m "
         "deflection_y_m torque_nm integral_nm estimate_radps reported_radps hall_count ride_m "
-        "ride_mps ride_mps2 road_m contact_m heading_rad creep_ratio"
+        "ride_mps ride_mps2 road_m contact_m heading_rad lagged_rad creep_ratio"
     )
 )
 """A wheel; its heading is that in the play of its linkage, and its creep is over the slip of the ground."""
@@ -266,7 +266,7 @@ def start_state(steer_rad: Array) -> Array:
     Its wheels hang in their play at ``steer_rad`` (3,).
     """
     wheels = np.zeros(3, WHEEL_STATE)
-    wheels["steer_rad"] = wheels["heading_rad"] = steer_rad
+    wheels["steer_rad"] = wheels["heading_rad"] = wheels["lagged_rad"] = steer_rad
     return filled(STATE, wheels=wheels, late_rad=steer_rad)
 
 
@@ -383,12 +383,15 @@ def step(
         w, out, radius_m = state.wheels[i], row.wheels[i], plant.radius_m[i]
         _steer_wheel(plant, w, steer_rad[i], dt)
         heading = row.encoder_rad[i] = w.steer_rad
-        if plant.linked:  # delay, play and offset of its linkage
+        if plant.linked:  # delay, gain, lag, play and offset of its linkage
             late, play = w.steer_rad, plant.effects.steering_backlash_rad
             delay_steps = round(plant.effects.steering_delay_s / dt)
             if delay_steps > 0:
                 place = state.n_steps % delay_steps
                 late, state.late_rad[place, i] = state.late_rad[place, i], w.steer_rad
+            tau_s, late = plant.effects.steering_lag_s, (1.0 + plant.effects.steering_gain_ratio) * late
+            w.lagged_rad += (1.0 - math.exp(-dt / tau_s) if tau_s > 0.0 else 1.0) * (late - w.lagged_rad)
+            late = w.lagged_rad
             w.heading_rad = min(max(w.heading_rad, late - play), late + play)
             heading = w.heading_rad + plant.steer_offset_rad[i]
         if i == 2 and plant.leg_backlash_rad > 0.0:

@@ -25,7 +25,8 @@ time constant does, too.
 tight the turn is, turn drag of the mean by the yaw rate; in fast arcs the track acts narrower.  With friction against
 lateral motion, ``m (dv_y/dt + w v) = -K v_y``, the robot slips to the outside of a turn: ``T dv_y/dt + v_y = -c v w``,
 ``c = T = m/K``; the two are parameters of their own.  The difference of the currents of the sides is that of yaw
-inertia and scrub.
+inertia, of the moment that resists turning, and, where the sides turn against each other, of the rolling resistance
+and friction of each.
 
 **Car-like robots** are the linear single-track model, at rest and fast alike.  With the lateral speed ``c`` of the
 centre of mass, ``a`` ahead of the rear axle and ``b`` behind the front one, ``L = a + b``, the yaw rate ``w``, the
@@ -124,8 +125,10 @@ from terrain.effects import (
     CURRENT,
     EFFECTS,
     GYRO,
+    GYRO_END,
     HEADING,
     INDEX,
+    RESTING_MPS,
     SLIDING_RADPS,
     SPEED_X,
     SPEED_Y,
@@ -207,6 +210,8 @@ traction at slips evenly spaced from 0 to 1; whether a camera above the field me
 
 # Lag of a swerve robot's IMU behind its latency: bandwidths of 47 and 62.5 Hz (Bosch BNO055 data sheet).
 IMU_LAG_S = 0.003
+# By how much less resists turning the larger its radius: 0.15 / 0.925 in Nikitin's formula, see ``turning_resistance``.
+NIKITIN = 0.16
 # Resistance to turning over the ground's grip; assumed: wheels of a side skid sideways over half the distance.
 SCRUB_SHARE = 0.4
 # Width of a tyre, and length of its contact on firm ground, over the wheel's radius, where a description has no
@@ -364,10 +369,11 @@ def lagged(values: Array, tau_s: float, dt: float) -> Array:
 
 
 @inner
-def steered(angle: Array, delay_s: float, backlash_rad: float, dt: float) -> Array:
-    """Return the angle (n,) of a wheel behind the delay of its linkage and a play of half a width, from its middle."""
-    if delay_s != 0.0:
-        angle = delayed(angle, delay_s / dt, 0.0)
+def steered(angle: Array, p: Any, dt: float) -> Array:
+    """Return the angle (n,) of a wheel behind lag, delay and play of its linkage, from the middle of the play."""
+    angle, backlash_rad = lagged(angle, p.steering_lag_s, dt), p.steering_backlash_rad
+    if p.steering_delay_s != 0.0:
+        angle = delayed(angle, p.steering_delay_s / dt, 0.0)
     if backlash_rad > 0.0:
         follower = angle[0]
         for k in range(angle.size):
@@ -403,8 +409,6 @@ def decayed(half_trace: float, determinant: float, dt: float) -> tuple[float, fl
     return both - half_trace * b, b
 
 
-# Speed over which a resistance takes its full size: it opposes motion and does not push a robot at rest.
-RESTING_MPS = 0.05
 # Slip that forces take at the most, of either sign; assumed: a straight thrust curve has no end of its own.
 MAX_SLIP = 0.9
 # Shorter time constants are none; one that falls faster than the second, in s/s, is taken as even.
@@ -426,6 +430,31 @@ def direction(speed_mps: float) -> float:
     (0.995, 0.0)
     """
     return speed_mps / math.sqrt(speed_mps * speed_mps + RESTING_MPS * RESTING_MPS)
+
+
+@inner
+def turned_wheels(encoder_mps: Array, p: Any, radius_m: float, dt: float) -> Array:
+    """Return wheel speeds (n, wheels) from those of encoders on the motors: a dead zone, then backlash of the gears.
+
+    The wheel stays within the play about the motor, and moves by that part of the motor's step that carries it along.
+    """
+    dead_mps, play_m = p.wheel_dead_zone_mps, p.drive_backlash_rad * radius_m
+    if dead_mps == 0.0 and play_m <= 0.0:
+        return encoder_mps
+    out = encoder_mps.copy()
+    for i in range(out.shape[1]):
+        before, ahead = 0.0, 0.0
+        for k in range(out.shape[0]):
+            speed = out[k, i] + dead_mps * direction(out[k, i])
+            out[k, i] = speed
+            if play_m > 0.0 and k > 0:
+                step = 0.5 * dt * (before + speed)
+                now = min(max(ahead - step, -play_m), play_m)
+                if step != 0.0:
+                    out[k, i] *= (step + (now - ahead)) / step
+                ahead = now
+            before = speed
+    return out
 
 
 @inner
@@ -485,14 +514,22 @@ def _move_skid(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array
     body, p, n = params[0].body, vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
     out = np.zeros(n, TRUTH)
     mass = body.mass_kg * (1.0 + p.payload_ratio)
-    scrub = (body.scrub_ratio + p.scrub_ratio) * (body.mass_kg * GRAVITY_MPS2)
+    weight = body.mass_kg * GRAVITY_MPS2
+    scrub, turning = (
+        (body.scrub_ratio + p.scrub_ratio) * weight,
+        (body.scrub_ratio + p.turning_resistance_ratio) * weight,
+    )
+    rolling = (body.rolling_ratio + p.rolling_resistance_ratio) * (1.0 + p.payload_ratio) * weight
+    wheels = turned_wheels(wheel_speed_mps, p, body.radius_m, dt)
     scale = 1.0 + p.wheel_radius_ratio
     radius_m = body.radius_m * scale
     right, left = 1.0 + 0.5 * p.one_sided_radius_ratio, 1.0 - 0.5 * p.one_sided_radius_ratio
     # speed without slip, yaw rate, how tight the turn is, difference of the sides
-    u, turn, tight, difference, scrub_n = np.empty(n), np.empty(n), np.zeros(n), np.empty(n), np.empty(n)
+    u, turn, tight, scrub_n = np.empty(n), np.empty(n), np.zeros(n), np.empty(n)
+    # what resists turning, and how the two sides differ in what resists each of them
+    moment_n, apart = np.empty(n), np.empty(n)
     for k in range(n):
-        v_l, v_r = wheel_speed_mps[k, 0] * scale * left, wheel_speed_mps[k, 1] * scale * right
+        v_l, v_r = wheels[k, 0] * scale * left, wheels[k, 1] * scale * right
         dv = v_r - v_l
         u[k] = 0.5 * (v_r + v_l)
         size = abs(dv) + 2.0 * abs(u[k])
@@ -502,10 +539,14 @@ def _move_skid(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array
             share = 1.0 - ENDO_POWER - (p.turning_slip_power_ratio if params[0].tracked else 0.0)
             a, b = abs(v_r) ** share, abs(v_l) ** share
             u[k] -= 0.5 * lost * (a - b) / (a + b)
-        difference[k] = dv
+        size = abs(dv) + NIKITIN * abs(u[k])
+        moment_n[k] = turning * (abs(dv) / size if size > 1e-6 else 0.0) * direction(dv)
+        moment_n[k] += 0.5 * p.viscous_drag_nspm * dv
+        apart[k] = 0.5 * (direction(v_r) - direction(v_l))
         turn[k] = (dv - lost) / (body.track_m * (1.0 + p.effective_track_ratio))
-        if p.track_narrowing_s2pm2 != 0.0:
+        if p.track_narrowing_s2pm2 != 0.0 or p.track_narrowing_by_turn_ratio != 0.0:
             x = p.track_narrowing_s2pm2 * (u[k] * turn[k]) ** 2 / (1.0 + (turn[k] / SLIDING_RADPS) ** 2)
+            x += p.track_narrowing_by_turn_ratio * abs(turn[k]) / (SLIDING_RADPS + abs(turn[k]))
             turn[k] *= 1.0 + x / (1.0 + abs(x))
     if p.yaw_delay_s != 0.0:
         turn = delayed(turn, p.yaw_delay_s / dt, 0.0)
@@ -523,8 +564,9 @@ def _move_skid(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array
         torque = (row.force_n + body.rotating_kg * wheel[k]) * radius_m
         row.current_a = (torque + body.friction_nm * direction(u[k])) / body.nm_per_a
         moment = body.yaw_inertia_kgm2 * (1.0 + p.payload_ratio) * spin[k]
-        force = 2.0 * moment / body.track_m + scrub * tight[k] * direction(difference[k])
-        row.turning_current_a = force * radius_m / body.nm_per_a
+        resists = rolling + p.slip_resistance_ratio * abs(slip[k]) * weight
+        force = 2.0 * moment / body.track_m + moment_n[k] + resists * apart[k]
+        row.turning_current_a = (force * radius_m + body.friction_nm * apart[k]) / body.nm_per_a
     if p.turn_side_slip_s != 0.0:
         out["speed_y_mps"][:] = lagged(-p.turn_side_slip_s * speed * turn, p.side_slip_build_up_s, dt)
     return out
@@ -548,9 +590,13 @@ def _move_bicycle(params: Array, vector: Array, dt: float, inputs: Inputs) -> Ar
     wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance = inputs
     body, p, n = params[0].body, vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
     out = np.zeros(n, TRUTH)
-    angle = (1.0 + p.steering_gain_ratio) * steer_rad[:, 0] + p.steering_offset_front_rad
-    steer = steered(angle, p.steering_delay_s, p.steering_backlash_rad, dt)
-    driven = wheel_speed_mps[:, 0] * np.cos(steer) if params[0].front_driven else wheel_speed_mps[:, -1]
+    angle = (1.0 + p.steering_gain_ratio) * steer_rad[:, 0]
+    if p.steering_dead_zone_rad > 0.0:
+        for k in range(n):
+            angle[k] -= min(max(angle[k], -p.steering_dead_zone_rad), p.steering_dead_zone_rad)
+    steer = steered(angle + p.steering_offset_front_rad, p, dt)
+    wheels = turned_wheels(wheel_speed_mps, p, body.radius_m, dt)
+    driven = wheels[:, 0] * np.cos(steer) if params[0].front_driven else wheels[:, -1]
     u = driven * (1.0 + p.wheel_radius_ratio)
     speed, rest, slip = slip_along(body, p, dt, u, np.zeros(n), grade_rad, disturbance, True)
     accel = slopes(speed, dt)
@@ -887,7 +933,7 @@ def _move_swerve(params: Array, vector: Array, dt: float, inputs: Inputs) -> Arr
     offsets = (p.steering_offset_1_rad, p.steering_offset_2_rad, p.steering_offset_3_rad)
     scales = (p.wheel_scale_1_ratio, p.wheel_scale_2_ratio, p.wheel_scale_3_ratio)
     for i in range(3):
-        angle[i] = steered(steer_rad[:, i] + offsets[i], p.steering_delay_s, p.steering_backlash_rad, dt)
+        angle[i] = steered((1.0 + p.steering_gain_ratio) * steer_rad[:, i] + offsets[i], p, dt)
     for k in range(n):
         square, total = 0.0, 0.0
         for i in range(3):
@@ -1169,7 +1215,8 @@ def sense(params: Array, vector: Array, dt: float, truth: Array) -> Array:
         row = truth[k]
         w = row.yaw_rate_radps
         v_x, v_y = point_velocity(row.speed_x_mps, row.speed_y_mps, w, lever_x, lever_y)
-        out[k, 0] = (1.0 + p.gyro_scale_ratio) * w + p.gyro_bias_radps + row.gyro_error_radps
+        bend = math.sqrt(max(1.0 + 2.0 * p.gyro_nonlinearity_s2 * w * w, GYRO_END))
+        out[k, 0] = (1.0 + p.gyro_scale_ratio) * w / bend + p.gyro_bias_radps + row.gyro_error_radps
         out[k, 1] = cos * v_x - sin * v_y
         out[k, 2] = sin * v_x + cos * v_y
         out[k, 3] = row.accel_x_mps2 + p.accel_bias_mps2

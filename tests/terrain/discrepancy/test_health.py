@@ -285,7 +285,7 @@ def test_a_reading_mends_no_channel_that_a_run_does_not_show():
 
 # -- Runs that are unfit ------------------------------------------------------------------------------------
 
-SAND = Ground(1.2, 0.35, 0.15, 0.3)
+SAND = Ground(1.8, 0.35, 0.2, 0.3)
 ODD, OTHERS = 2, ("imu", "odometry")
 """Which of the runs has the fault, and the streams of the logger that is not the wheels'."""
 

@@ -14,7 +14,7 @@ from terrain.discrepancy.health.fault import Change, Column, Fault, FaultKind
 from terrain.discrepancy.held_out import repair_held_out, split_runs
 from terrain.discrepancy.runs import Simulation, low_pass_of, signals_of
 from terrain.discrepancy.verdict import INTERVAL_T
-from terrain.effects import CHANNELS, GYRO
+from terrain.effects import CHANNELS, CURRENT, GYRO, TURNING_CURRENT
 from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog
 from terrain.robots import load_robot
@@ -47,7 +47,13 @@ def gain(runs, effects, seed=0):
     low_pass = low_pass_of(runs)
     compared = compare_runs(simulation, simulation.with_effects(effects), runs, low_pass)
     none = [np.zeros_like(run.measured) for run in compared]
-    return gain_of(compared, none, dict.fromkeys(CHANNELS, 0.01), seed, "7 runs held out")
+    return gain_of(
+        compared,
+        none,
+        dict.fromkeys(CHANNELS, 0.01) | {CURRENT: 1.0, TURNING_CURRENT: 1.0},
+        seed,
+        "7 runs held out",
+    )
 
 
 def test_the_true_extension_leaves_noise_and_scatter(longer):
@@ -58,7 +64,7 @@ def test_the_true_extension_leaves_noise_and_scatter(longer):
     # what is left ahead: noise, and radii that scatter by 0.003 of 0.4 m/s
     assert ahead.rms_after < 0.006 < ahead.rms_before
     assert ahead.reduction == pytest.approx(1.0 - (ahead.rms_after / ahead.rms_before) ** 2)
-    assert found.channels["turning_current_a"].refused
+    assert found.channels["speed_y_mps"].refused
     assert (ahead.learner_reduction, ahead.learner_rms) == (0.0, ahead.rms_before)
     assert gain(longer[:2], LONGER).clusters == "thirds of runs"
 

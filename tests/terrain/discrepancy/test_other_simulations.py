@@ -120,7 +120,7 @@ def relabelled(runs, label):
 
 
 def test_runs_are_simulated_on_the_soil_of_their_label_where_they_need_it():
-    runs = dynamic_runs(n=6, duration_s=20.0)
+    runs = dynamic_runs(n=9, duration_s=20.0)
     simulation, matches = simulation_for(runs, AGRIMARO, LIBRARY)
     assert [match[:2] for match in matches] == [("grass", "grass")]
     soil = planar_ground(AGRIMARO, load_soil("grass"))
@@ -145,7 +145,7 @@ def test_a_label_that_helps_no_run_changes_nothing():
 
 @pytest.mark.parametrize(("robot", "effective"), [(AGRIMARO, 0.0), (HUSKY, 1.0)])
 def test_tilt_acts_as_a_slope_but_not_where_a_body_rides_over_bumps(robot, effective):
-    runs = dynamic_runs(robot=robot, n=6, vary=robot is HUSKY, duration_s=30.0)
+    runs = dynamic_runs(robot=robot, n=9, vary=robot is HUSKY, duration_s=30.0)
     simulation, _ = simulation_for(runs, robot, library_of(robot.drive))
     ground = simulation.grounds.get("grass", Ground())
     assert ground.effective_ratio == pytest.approx(effective, abs=0.05)

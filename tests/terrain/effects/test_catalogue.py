@@ -49,7 +49,15 @@ SMALL_ROBOT = {"omni": {CURRENT: 0.15}, "mecanum": {CURRENT: 0.15}}
 
 LEFT_OUT = {
     "omni": (
-        *("gyro_bias", "gyro_scale", "accel_bias", "imu_latency", "clock_offset", "clock_rate"),
+        *(
+            "gyro_bias",
+            "gyro_scale",
+            "gyro_nonlinearity",
+            "accel_bias",
+            "imu_latency",
+            "clock_offset",
+            "clock_rate",
+        ),
         *("encoder_lag", "motor_constant", "motor_drift", "current_offset"),
     ),
     "bicycle": ("payload", "rolling_resistance", "viscous_drag", "slip_resistance", "current_offset"),
@@ -136,7 +144,20 @@ def test_names_are_unique_and_entries_are_whole():
             assert p.low <= p.plausible[0] <= 0.0 < p.plausible[1] <= p.high
             assert p.plausible_source
             assert 0.0 < p.step < 0.1 * p.high
-            assert p.unit in ("ratio", "rad", "s", "s2", "s2pm", "s2pm2", "m", "a", "radps", "mps2", "nspm")
+            assert p.unit in (
+                "ratio",
+                "rad",
+                "s",
+                "s2",
+                "s2pm",
+                "s2pm2",
+                "m",
+                "a",
+                "mps",
+                "radps",
+                "mps2",
+                "nspm",
+            )
             assert p.homes or effect.stage is not Stage.DESCRIPTION
             for home in p.homes:  # a number of a description
                 part = getattr(robot, home.section) if home.section else robot
@@ -153,7 +174,7 @@ gear_wear:
   source: a test
   parameters:
     gear_wear_ratio: {low: -0.1, high: 0.1, plausible: [0, 0.1], plausible_source: z, step: 0.001,
-      one_sided: true, scatter_rank: 10, as_percent: true, is_error: true, deprecated: [worn_ratio],
+      one_sided: true, scatter_rank: 11, as_percent: true, is_error: true, deprecated: [worn_ratio],
       homes: {motors.efficiency_ratio: x (1 + e)}}
   drives: [swerve]
   channels: [current_a]

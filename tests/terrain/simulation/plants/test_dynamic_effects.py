@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects import library_of
+from terrain.effects import bent_rate, library_of
 from terrain.extension import corrected, corrected_log
 from terrain.kinematics.camera import body_motion
 from terrain.kinematics.wheels import no_slip_twist
@@ -128,6 +128,12 @@ def gyro_slope(run, robot):
     return slope(np.interp(imu.time_s, camera.time_s, camera.channel("rate_y_radps")), gyro(run, robot)[1])
 
 
+def steering_gain(run, robot):
+    steering = run.streams["steering"]
+    angle = np.unwrap(steering.channel("angle_2_rad")) - robot.steering_zeros_rad[1]
+    return slope(angle, truth(run, "steer_2_rad", steering.time_s))
+
+
 def counted(i):
     """Measured over true rate of a wheel."""
 
@@ -211,9 +217,12 @@ CASES = {
         for i, component in ((1, 2), (2, 2), (3, 1))
     },
     "steering_backlash": ((0.04,), "complex", "grass", LEVEL, PLAY, 0.04, True),
+    "steering_gain": ((0.08,), "complex", "grass", LEVEL, steering_gain, 0.08, True),
+    "steering_lag": ((0.08,), "complex", "grass", LEVEL, STEERING_LATE, 0.08, True),
     "steering_delay": ((0.08,), "complex", "grass", LEVEL, STEERING_LATE, 0.08, True),
     "gyro_bias": ((0.03,), "straight", "grass", LEVEL, GYRO_STANDING, 0.03, True),
     "gyro_scale": ((-0.05,), "spot_turn", "tiles", LEVEL, gyro_slope, -0.05, True),
+    "gyro_nonlinearity": ((0.3,), "spot_turn", "tiles", LEVEL, gyro_slope, None, True),
     "accel_bias": ((0.3,), "straight", "grass", LEVEL, ACCEL_STANDING, 0.3, True),
     "imu_latency": ((0.06,), "complex", "grass", LEVEL, IMU_LATE, 0.06, True),
     "camera_latency": ((0.06,), "starts", "grass", LEVEL, CAMERA_LATE, 0.06, True),
@@ -238,7 +247,9 @@ CASES = {
 def change_of(name, clean, run, values):
     """Return what the catalogue's formula makes of the runs, where no constant says it."""
     f = traction(clean, ROBOT)
+    turn = seen(clean, ROBOT)[3]
     return {
+        "gyro_nonlinearity": lambda: slope(turn, bent_rate(turn, *values)) - 1.0,
         "force_slip": lambda: values[0] * f,
         "shear_slip": lambda: values[0] * shear_slip(f, load_soil("tiles").peak_friction_ratio),
         "slip_resistance": lambda: values[0] * slips(run, ROBOT),

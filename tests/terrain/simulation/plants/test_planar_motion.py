@@ -8,8 +8,20 @@ import numpy as np
 import pytest
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, SPEED_X, SPEED_Y, TURNING_CURRENT, vector_of
+from terrain.effects import (
+    ACCEL,
+    CHANNELS,
+    CURRENT,
+    GYRO,
+    SPEED_X,
+    SPEED_Y,
+    TURNING_CURRENT,
+    bent_rate,
+    vector_of,
+)
+from terrain.extension import corrected_log
 from terrain.kinematics.commands import wheel_command_step
+from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.plants.dynamic import DEFLECTION_DAMPING_S, shear_slip
 from terrain.simulation.plants.planar import (
@@ -308,15 +320,106 @@ def test_forces_and_currents_balance(robot):
 
 
 def test_turning_takes_current_of_the_difference_of_the_sides():
-    ground = Ground(scrub_ratio=0.2)
-    planar = make_planar(HUSKY, ground)
-    n_per_a = planar.body["nm_per_a"][0] / HUSKY.wheel_radius_m
-    weight = HUSKY.mass_kg * GRAVITY_MPS2
-    for sign in (1.0, -1.0):
-        spot = replayed(HUSKY, {"scrub_ratio": 0.1}, at_rate([-0.3 * sign, 0.3 * sign]), ground=ground)
-        assert spot[TURNING_CURRENT][-1] * n_per_a == pytest.approx(0.3 * weight * direction(0.6 * sign))
+    ground, robot = Ground(scrub_ratio=0.2, rolling_ratio=0.06), HUSKY
+    planar = make_planar(robot, ground)
+    n_per_a = planar.body["nm_per_a"][0] / robot.wheel_radius_m
+    weight, speed = robot.mass_kg * GRAVITY_MPS2, 0.3
+    # each side has its own rolling resistance and friction, of which in place nothing is left in the sum
+    own_n = (0.06 * weight + 2.0 * robot.motors.friction_nm / robot.wheel_radius_m) * direction(speed)
+    drag = {"viscous_drag_nspm": 40.0}
+    for sign, given in product((1.0, -1.0), ({}, drag)):
+        values = {"turning_resistance_ratio": 0.1, **given}
+        spot = replayed(robot, values, at_rate([-speed * sign, speed * sign]), ground=ground)
+        force = sign * (
+            0.3 * weight * direction(2 * speed) + own_n + given.get("viscous_drag_nspm", 0.0) * speed
+        )
+        assert spot[TURNING_CURRENT][-1] * n_per_a == pytest.approx(force)
         assert spot[CURRENT][-1] == pytest.approx(0.0, abs=1e-9)
+    # in arcs by Nikitin's formula, and no more in the sum than scrub; that takes nothing of the difference
+    radius_m = np.array([0.5, 2.0, 8.0])
+    arcs = [skid(robot, np.full(N, 0.5), 0.5 / r) for r in radius_m]
+    by, more, scrubbed = (
+        [replayed(robot, v, arc, ground=ground) for arc in arcs]
+        for v in ({}, {"turning_resistance_ratio": 0.4}, {"scrub_ratio": 0.4})
+    )
+    force_n = (
+        np.array([(m[TURNING_CURRENT] - b[TURNING_CURRENT])[-1] for m, b in zip(more, by, strict=True)])
+        * n_per_a
+    )
+    dv = 0.5 * robot.track_m / radius_m
+    nikitin = 0.925 / (0.925 + 0.15 * radius_m / robot.track_m)
+    np.testing.assert_allclose(
+        force_n / (0.4 * weight * np.array([direction(v) for v in dv])), nikitin, rtol=0.01
+    )
+    for b, m, s in zip(by, more, scrubbed, strict=True):
+        assert m[CURRENT][-1] == b[CURRENT][-1] < s[CURRENT][-1]
+        assert s[TURNING_CURRENT][-1] == pytest.approx(b[TURNING_CURRENT][-1], rel=1e-3)
     spin = 0.4 / TIME_S[-1]
-    speeding = replayed(HUSKY, {}, skid(HUSKY, np.full(N, 0.6), spin * TIME_S))
+    speeding = replayed(robot, {}, skid(robot, np.full(N, 5.0), spin * TIME_S))
     moment = planar.body["yaw_inertia_kgm2"][0] * spin
-    assert speeding[TURNING_CURRENT][N // 2] * n_per_a == pytest.approx(2 * moment / HUSKY.track_m)
+    assert speeding[TURNING_CURRENT][N // 2] * n_per_a == pytest.approx(2 * moment / robot.track_m, rel=1e-3)
+
+
+def test_a_track_narrows_or_widens_with_the_turn_alone():
+    for turn, k in product((0.3, -2.0), (0.4, -0.3)):
+        shown = speeds(skid(HUSKY, 0.5, turn), {"track_narrowing_by_turn_ratio": k})[GYRO][-1]
+        x = k * abs(turn) / (1.0 + abs(turn))
+        assert shown == pytest.approx(turn * (1.0 + x / (1.0 + abs(x))))
+
+
+def test_a_gyro_bends_and_saturates():
+    for turn in (0.2, -1.5, 30.0):
+        shown = speeds(skid(HUSKY, 0.0, turn), {"gyro_nonlinearity_s2": 0.08, "gyro_scale_ratio": 0.1})[GYRO][
+            -1
+        ]
+        assert shown == pytest.approx(1.1 * bent_rate(turn, 0.08))
+    assert shown < 1.1 / math.sqrt(0.16)
+
+
+def test_a_wheel_follows_its_motor_through_play_and_a_dead_zone():
+    """At a reversal the wheel stands until the motor has crossed the backlash."""
+    speed = np.where(TIME_S < 10.0, 0.5, -0.5)[:, None] * np.minimum(np.abs(TIME_S - 10.0), 1.0)[:, None]
+    both = np.hstack([speed, speed])
+    played = replayed(still(HUSKY), {"drive_backlash_rad": 0.2}, both)[SPEED_X]
+    lost_m = 0.2 * HUSKY.wheel_radius_m
+    ahead = TIME_S < 10.0
+    assert DT * (speed[ahead, 0] - played[ahead]).sum() == pytest.approx(lost_m, rel=0.02)  # from its middle
+    assert DT * (played[~ahead] - speed[~ahead, 0]).sum() == pytest.approx(2 * lost_m, rel=0.06)
+    assert (played * speed[:, 0] > -1e-9).all()  # a wheel does not turn back in the play
+    dead = speeds(at_rate([0.4, -0.4]), {"wheel_dead_zone_mps": 0.03})
+    assert dead[GYRO][-1] == pytest.approx(-2 * (0.4 + 0.03 * direction(0.4)) / HUSKY.track_m)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("husky", {"drive_backlash_rad": 0.1, "wheel_dead_zone_mps": 0.02}),
+        ("adap2e", {"drive_backlash_rad": 0.1, "wheel_dead_zone_mps": 0.02}),
+        ("adap2e", {"steering_gain_ratio": -0.1}),
+        ("adap2e", {"steering_dead_zone_rad": 0.03, "steering_gain_ratio": 0.1}),
+        ("adap2e", {"steering_lag_s": 0.2, "steering_gain_ratio": 0.1, "steering_offset_front_rad": 0.02}),
+        ("adap2e", {"steering_lag_s": 0.2, "steering_backlash_rad": 0.03}),
+        ("agrimaro", {"steering_gain_ratio": 0.05, "steering_lag_s": 0.15}),
+    ],
+)
+def test_what_comes_off_a_log_is_what_the_replay_puts_on(name, values):
+    """Two routes: the replay of a log with effects, and that without of the corrected log."""
+    robot = load_robot(name)
+    wheels = 0.5 * np.sin(0.9 * TIME_S)[:, None] * np.linspace(1.0, 1.2, len(robot.wheels))
+    wheels = wheels[:, -1:] if name == "adap2e" else wheels
+    steer = 0.2 * np.sin(0.7 * TIME_S + 0.4)[:, None] * np.ones(max(len(robot.steer_channels), 2))
+    logged = {}
+    speed_names = [f"speed_{w}_mps" for w in robot.logged_wheels]
+    logged["wheels"] = Stream(TIME_S, wheels, tuple(speed_names[-wheels.shape[1] :]))
+    if robot.steered:
+        zeros = robot.steering_zeros_rad[: len(robot.steer_channels)]
+        logged["steering"] = Stream(TIME_S, steer[:, : len(zeros)] + zeros, robot.steer_channels)
+    back = corrected_log(RunLog("a", name, logged), replace(robot, effects=values)).streams
+    true_steer = steer.copy()
+    if robot.steered:
+        true_steer[:, : len(zeros)] = back["steering"].values - zeros
+    planar = make_planar(robot, FREE)
+    level = np.zeros(N)
+    one = replay(planar, vector_of(values), DT, wheels, steer, level, level)
+    other = replay(planar, vector_of({}), DT, back["wheels"].values, true_steer, level, level)
+    np.testing.assert_allclose(one[5:], other[5:], atol=2e-3)
