@@ -440,7 +440,7 @@ def _withdraw(
     """Note why a cause is withdrawn, and return the others, fitted without it."""
     withdrawn[cause.name] = cause_of(problem, fit, cause, reason)
     others = [other for other in fit.causes if other is not cause and other.modifies != cause.name]
-    return refit(problem, fit.info, others)
+    return refit(problem, fit.info, others)._replace(pairs=fit.pairs)
 
 
 def _probes(problem: Problem, fit: CauseFit) -> dict[tuple[str, str], ProbeResult]:
@@ -615,6 +615,8 @@ def cause_of(problem: Problem, fit: CauseFit, effect: Effect, reason: str = "") 
         values, parameter = values_of(fit, effect), effect.parameters[0]
         caveat = constancy_of_cause(fit, effect).caveat
         caveats = [caveat] if caveat else []
+        if effect.name in fit.pairs:
+            caveats.append(f"{' with '.join(fit.pairs[effect.name])} does little more in its place")
         scatter = constancy.run_scatter(problem, fit, parameter.name)
         value = float(fit.change[fit.names.index(parameter.name)])
         if len(effect.parameters) == 1 and scatter > constancy.CAVEAT_RATIO * abs(value):

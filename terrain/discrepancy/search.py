@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import replace
+from itertools import combinations, permutations
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -170,6 +171,10 @@ SHARED = 0.5
 """Least correlation of what a cause and its rival change: one that shares less with it explains something
 else, and is no rival, however little worse it fits."""
 
+LOST_RATIO = 0.2
+"""Part of what a cause gains in its clearest channel that a rival may lose there: what cannot change a gyro, by itself
+or by what the other causes take over, is no rival of its scale however noisy other channels are."""
+
 PLAUSIBLE_STDS = 2.36
 """Standard deviations by which a rival may be beyond its plausible range: the half of a 95 % interval."""
 
@@ -201,6 +206,7 @@ def rivals_of(
             behind = min(fits[0][0] - own[0][0], fits[1][0] - own[1][0]) / inflation
             here, square = fits[0][1], float(own[0][1].c[0])
             worse = float(here.c[0]) > (1.0 + RIVAL_RISE) * square + RIVAL_LOSS * inflation
+            worse = worse or not _acts_there(problem, info, names_of(others), own[0][1], here)
             if not worse and behind < (TWIN_LOSS if alike > TWIN else RIVAL_LOSS):
                 its = [p.name for p in effect.parameters]
                 at, places = [INDEX[name] for name in its], here.places(its)
@@ -211,6 +217,18 @@ def rivals_of(
         as_good.sort(key=lambda rival: rival[0])
         rivals[cause.name] = {name: (change, std) for _, name, change, std in as_good}
     return rivals
+
+
+def _acts_there(
+    problem: Problem, info: Evidence, others: Sequence[str], cause: Evidence, rival: Evidence
+) -> bool:
+    """Return whether a rival gains in the clearest channel of a cause what that does, beside other parameters."""
+    point = move_point(info.vector, others, info.fit(others)[0] if others else ())
+    fits = problem.near(info, point, ()), cause, rival
+    without, with_cause, with_rival = [sum((w[-1] ** 2).sum(axis=0) for w in each.white) for each in fits]
+    gained = without - with_cause
+    main = int(np.argmax(gained))
+    return bool(with_rival[main] - with_cause[main] <= max(RIVAL_LOSS, LOST_RATIO * gained[main]))
 
 
 def _near(
@@ -244,6 +262,8 @@ one's gain, so many at most."""
 Z_PAIR = 4.6
 """Evidence that each of two effects needs beside the other, if neither is significant alone: 4e-6."""
 
+ONE_RATIO = 0.8  #: Part of the gain of two causes, from which on one effect is preferred to them
+
 ALIKE = 0.99  #: Two effects whose sensitivities correlate more are not taken for a pair
 
 
@@ -257,6 +277,8 @@ class CauseFit(NamedTuple):
     cov: Array
     tests: dict[str, WaldTest]  #: evidence of every effect of the library beside them
     rivals: Mapping[str, Rivals] = MappingProxyType({})  #: by cause, once they have been looked for
+    pairs: Mapping[str, tuple[str, str]] = MappingProxyType({})
+    """By cause that is preferred to two, the names of these."""
 
     def at(self, effect: Effect) -> list[int]:
         """Return the places of the parameters of a cause."""
@@ -282,7 +304,14 @@ def search(problem: Problem, start: Evidence, seeds: Mapping[str, float] | None 
 def search_on(problem: Problem, info: Evidence, causes: Sequence[Effect]) -> CauseFit:
     """Return the causes that explain the runs, from some that are fitted to them."""
     more, at = _add_causes(problem, info, list(causes))
-    return cause_fit(problem, at, more)
+    pairs: dict[str, tuple[str, str]] = {}
+    while (one := _one_for_two(at, problem.candidates, more)) is not None:
+        effect, pair = one
+        single, there = _refit_significant(problem, at, [*[c for c in more if c not in pair], effect])
+        if effect not in single or len(single) >= len(more):
+            break
+        more, at, pairs[effect.name] = single, there, (pair[0].name, pair[1].name)
+    return cause_fit(problem, at, more)._replace(pairs=pairs)
 
 
 def refit(problem: Problem, info: Evidence, causes: Sequence[Effect]) -> CauseFit:
@@ -393,6 +422,34 @@ def _swap_for_better(problem: Problem, info: Evidence, causes: list[Effect]) -> 
             break
         causes, info = swapped, at
     return causes, info
+
+
+def _one_for_two(
+    info: Evidence, library: Sequence[Effect], causes: Sequence[Effect]
+) -> tuple[Effect, tuple[Effect, Effect]] | None:
+    """Return an effect that does nearly as much as two causes, one of which is nothing without the other.
+
+    Each may take back what the other does wrong in a channel, where one effect does that by itself.  It has to be
+    clearly better than either of the two alone.
+    """
+    for pair in combinations(causes, 2):
+        if any(one.modifies == other.name for one, other in permutations(pair)):
+            continue
+        others = names_of([cause for cause in causes if cause not in pair])
+        alone = [wald_test(info, others, cause) for cause in pair]
+        if all(test.significant for test in alone):
+            continue
+        left = info.loss(others)
+        both, *each = [left - info.loss((*others, *names_of(few))) for few in (pair, pair[:1], pair[1:])]
+        gains = {}
+        for effect in library:
+            if effect not in causes and wald_test(info, others, effect).inside:
+                gain = left - info.loss((*others, *names_of([effect])))
+                if gain > ONE_RATIO * both and both - gain < 0.5 * (both - max(each)):
+                    gains[effect] = gain
+        if gains:
+            return max(gains, key=lambda effect: gains[effect]), pair
+    return None
 
 
 def _pair(info: Evidence, names: Sequence[str], library: Sequence[Effect]) -> list[Effect]:

@@ -88,6 +88,7 @@ def test_a_set_of_causes_is_not_reached_twice(three, monkeypatch):
 
     monkeypatch.setattr(search_module, "_pair", in_turn)
     monkeypatch.setattr(search_module, "_swap_for_better", lambda _, info, causes: (causes, info))
+    monkeypatch.setattr(search_module, "_one_for_two", lambda *_: None)
     assert [cause.name for cause in search(problem, fit.info).causes] == ["payload", "camera_yaw"]
     with_third = {"payload", "camera_yaw", "gyro_bias"}
     assert fitted == [{"payload"}, {"payload", "camera_yaw"}, with_third, {"payload", "gyro_bias"}]
@@ -156,6 +157,8 @@ def test_what_changes_other_channels_is_no_rival(posed, solve, monkeypatch):
     # as if the yaw had been withdrawn
     assert rivals_of(problem, fit.info, start, [payload]) == {"payload": {}}
     monkeypatch.setattr(search_module, "SHARED", -1.0)
+    assert rivals_of(problem, fit.info, start, [payload]) == {"payload": {}}
+    monkeypatch.setattr(search_module, "_acts_there", lambda *_: True)
     rivals = rivals_of(problem, fit.info, start, [payload])["payload"]
     assert "camera_yaw" in rivals
 
@@ -226,7 +229,50 @@ def test_an_effect_that_is_little_behind_is_a_rival(monkeypatch, behind, square,
     monkeypatch.setattr(search_module, "replace", lambda *_, **__: None)
     monkeypatch.setattr(search_module, "fit_again", fit)
     monkeypatch.setattr(search_module, "_near", lambda *_: [(other, alike)])
+    monkeypatch.setattr(search_module, "_acts_there", lambda *_: True)
     monkeypatch.setattr(search_module, "wald_test", lambda *_: SimpleNamespace(inflation=inflation))
     rivals = rivals_of(None, info, start, [cause])[cause.name]
     assert list(rivals) == [other.name] * is_rival
     assert all((change[0], std[0]) == pytest.approx((0.1, 0.01)) for change, std in rivals.values())
+
+
+@pytest.mark.parametrize(("lost", "acts"), [(7.0, True), (19.0, True), (21.0, False)])
+def test_a_rival_acts_where_the_cause_shows(lost, acts):
+    """What it gains in another channel is no amends: the cause gains 100 in the first one."""
+    without, cause, rival = (
+        SimpleNamespace(white=[np.sqrt([[[square, other]]])])
+        for square, other in ((150.0, 50.0), (50.0, 40.0), (50.0 + lost, 0.0))
+    )
+    problem = SimpleNamespace(near=lambda *_: without)
+    info = SimpleNamespace(vector=np.zeros(len(INDEX)))
+    assert search_module._acts_there(problem, info, (), cause, rival) == acts
+
+
+@pytest.mark.parametrize(
+    ("one", "first", "depends", "preferred"),
+    [
+        (90.0, 60.0, True, True),
+        (75.0, 40.0, True, False),  # it leaves too much
+        (90.0, 85.0, True, False),  # the first of the two is nearly as good by itself
+        (90.0, 60.0, False, False),  # both are there without the other
+    ],
+)
+def test_one_effect_that_does_nearly_as_much_as_two_that_need_each_other(
+    monkeypatch, one, first, depends, preferred
+):
+    slip, lever, scale = (effect_named(name) for name in ("turning_slip", "lever_arm", "gyro_scale"))
+    gains = {
+        names_of([slip, lever]): 100.0,
+        names_of([slip]): first,
+        names_of([lever]): 3.0,
+        names_of([scale]): one,
+        (): 0.0,
+    }
+
+    def test_of(info, beside, effect):
+        return SimpleNamespace(significant=effect is slip or not depends, inside=True)
+
+    monkeypatch.setattr(search_module, "wald_test", test_of)
+    info = SimpleNamespace(loss=lambda parameters: -gains[tuple(parameters)])
+    found = search_module._one_for_two(info, (slip, lever, scale), [slip, lever])
+    assert found == ((scale, (slip, lever)) if preferred else None)
