@@ -114,7 +114,7 @@ def explain(
 
     Parameters
     ----------
-    runs : of the robot, three or more
+    runs : of the robot, three or more; of one or two that are long, parts count as runs
     robot : whose simulation is tested, with the effects that its description has; or its name
     data : name of the data set, for the report
     description : of the robot, for the report and the suggested command; its name by default
@@ -144,6 +144,7 @@ def explain(
     from terrain.discrepancy.robot_terms import in_robot_terms
     from terrain.effects import library_of, showing
     from terrain.extension import region_of
+    from terrain.logs.cuts import cut_long, cut_note
     from terrain.logs.run_folders import data_digest
     from terrain.robots import load_robot
 
@@ -152,7 +153,8 @@ def explain(
     description = description or robot.name
     names, seed = asked.effects, asked.seed
     library = showing(robot.drive, robot.effects) if names is None else library_of(robot.drive, names)
-    chosen = chosen_runs(runs, robot, asked.terrain)
+    parts = cut_long(runs)
+    chosen = chosen_runs(parts, robot, asked.terrain)
     diagnosed = diagnose_runs(chosen, robot, library, asked.hold_out, seed)
     progress("diagnose", 1, 1)
     gained = held_out_gain(diagnosed, robot, seed)
@@ -185,8 +187,13 @@ def explain(
             cause.name: in_robot_terms(cause.name, cause.parameters, robot) for cause in diagnosis.built_in
         },
         next_command=next_command(diagnosis.next_drive, description, robot, diagnosed.terrains),
-        notes=notes_of(
-            diagnosis, diagnosed.terrains, terrains_apart(diagnosis.differing_channels, diagnosed.compared)
+        notes=(
+            *cut_note(runs, parts),
+            *notes_of(
+                diagnosis,
+                diagnosed.terrains,
+                terrains_apart(diagnosis.differing_channels, diagnosed.compared),
+            ),
         ),
         powertrain=powertrain_of(chosen, robot, diagnosis.faults, seed),
     )

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.ndimage import median_filter
 
-from terrain.angles import unwrapped
+from terrain.angles import unwrapped, wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import (
     ACCEL,
@@ -45,7 +45,8 @@ from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
 from terrain.kinematics.wheels import rolled_twist
 from terrain.learned_term import FIELDS, LearnedTerm
-from terrain.logs.schema import POSE_CHANNELS
+from terrain.logs.counters import count_rates
+from terrain.logs.schema import GNSS_CHANNELS, POSE_CHANNELS, TWIST
 from terrain.records import Array, RunLog
 from terrain.robots import BicycleRobot, Robot
 from terrain.simulation.plants.planar import (
@@ -152,6 +153,9 @@ MIN_LENGTH_S = 4.0  #: Of a shorter run nothing is left once filters have settle
 #: and by so many times the usual deviation.
 JUMP_S, JUMP_MPS, JUMP_SIGMAS = 0.05, 0.1, 8.0
 
+POSITION, VELOCITY = GNSS_CHANNELS[:2], GNSS_CHANNELS[2:4]  #: Of a receiver.
+#: Course over ground is the heading of a robot that is faster: a receiver's velocity is off by 0.02 to 0.05 m/s.
+MOVING_MPS = 0.4
 #: A wheel turns backward if it is faster than that on at least so many samples.
 BACKWARD_MPS, MIN_BACKWARD = 0.02, 5
 #: A run whose currents are not known in more than that ratio of its samples counts as one without.
@@ -293,15 +297,12 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
     is_motor = names[0].startswith("motor")
     scale = robot.wheel_radius_m / robot.motors.reduction_ratio if is_motor else 1.0
     speeds = wheels.columns(names) * scale
-    # poses of an omni robot's body (of a camera above, motion capture) count where nothing else measures its speed
-    pose, lidar = run.streams.get("pose"), run.streams.get("lidar")
-    others = "odometry" in run.streams or (lidar is not None and "speed_x_mps" in lidar.channels)
-    by_pose = (
-        robot.on_omni_wheels and pose is not None and set(POSE_CHANNELS) <= set(pose.channels) and not others
-    )
+    outside = _outside(run, robot)
 
     used = [*inputs, *(each for each in ("imu", "odometry", "lidar") if each in run.streams)]
-    spans_s = np.array([run.streams[each].time_s[[0, -1]] for each in [*used, "pose"][: len(used) + by_pose]])
+    spans_s = np.array(
+        [run.streams[each].time_s[[0, -1]] for each in [*used, outside][: len(used) + bool(outside)]]
+    )
     start_s, end_s = float(spans_s[:, 0].max()), float(spans_s[:, 1].min())
     rate_hz = min(MAX_RATE_HZ, wheels.rate_hz)
     n = math.floor((end_s - start_s) * rate_hz + 1e-6) + 1 if end_s > start_s else 0
@@ -327,7 +328,7 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
     if imu is not None and has_tilt:
         tilt = resampled(imu.time_s, np.column_stack([-imu.channel("pitch_rad"), imu.channel("roll_rad")]))
     measured = np.full((n, len(CHANNELS)), np.nan)
-    for channel, stamps_s, values in _measurements(run, robot, has_tilt, by_pose):
+    for channel, stamps_s, values in _measurements(run, robot, has_tilt, outside, time_s):
         measured[:, CHANNELS.index(channel)] = _resample(time_s, stamps_s, values)
     names = [f"current_{wheel}_a" for wheel in robot.wheels]
     # of motors that are not described no current is known: a traction of 1 N would count as 1 A
@@ -354,7 +355,7 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
     if not np.isfinite(measured).any():
         raise DataError(
             f"{name}: none of its channels is simulated; a gyro, currents of all wheels, a speed "
-            "over ground or an accelerometer with its tilt is required"
+            "over ground, poses, GNSS or an accelerometer with its tilt is required"
         )
     terrain = run.terrains[0] if len(run.terrains) == 1 else ""
     on_clock = resampled(wheels.time_s, speeds), steer, tilt[:, 0], tilt[:, 1], measured
@@ -364,21 +365,70 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
     return Signals(run.run_id, terrain, 1 / rate_hz, float(time_s[0]), *on_clock, run.session, axes=axes)
 
 
+def _outside(run: RunLog, robot: Robot) -> str:
+    """Return the stream of poses, or else of GNSS, that counts where no lidar measures all motion; empty of none."""
+    pose, gnss, lidar = (run.streams.get(name) for name in ("pose", "gnss", "lidar"))
+    if lidar is not None and set(TWIST) <= set(lidar.channels):
+        return ""
+    if pose is not None and set(POSE_CHANNELS) <= set(pose.channels):
+        return "pose"
+    better = lidar is not None or "odometry" in run.streams
+    if gnss is None or better or robot.sideways:  # a receiver's velocity has no heading
+        return ""
+    return "gnss" if any(set(names) <= set(gnss.channels) for names in (VELOCITY, POSITION)) else ""
+
+
+def _gnss_motion(run: RunLog, robot: Robot) -> tuple[Array, Array]:
+    """Return speed ahead and heading rate (n,) at the fixes of a receiver, of a body that moves where it points.
+
+    The speed has the sign of the wheels; the rate is that of the course, known while the robot moves.  Velocities are
+    those of the receiver, or central differences of its positions.
+    """
+    gnss, wheels = run.streams["gnss"], run.streams["wheels"]
+    time_s = gnss.time_s
+    if set(VELOCITY) <= set(gnss.channels):
+        east, north = gnss.columns(VELOCITY).T
+    else:
+        east, north = (count_rates(time_s, column) for column in gnss.columns(POSITION).T)
+        east[[0, -1]] = np.nan  # there they are half a period off
+    names = [name for name in robot.rate_channels if name in wheels.channels] or list(wheels.channels[:1])
+    rolled = wheels.columns(names).mean(axis=1)
+    known = np.isfinite(rolled)
+    backward = (
+        np.interp(time_s, wheels.time_s[known], rolled[known]) < 0.0 if known.any() else time_s < -np.inf
+    )
+    speed, course = np.hypot(east, north), np.arctan2(north, east) + np.pi * backward
+    course[~(speed > MOVING_MPS)] = np.nan
+    rate = np.full(len(time_s), np.nan)
+    if len(time_s) > 2:
+        rate[1:-1] = wrapped(course[2:] - course[:-2]) / (time_s[2:] - time_s[:-2])
+    return np.where(backward, -speed, speed), rate
+
+
 def _measurements(
-    run: RunLog, robot: Robot, has_tilt: bool, by_pose: bool
+    run: RunLog, robot: Robot, has_tilt: bool, outside: str, time_s: Array
 ) -> Iterator[tuple[str, Array, Array]]:
     """Yield what sensors measured: channel, stamps and values; of one channel the last counts.
 
-    Speeds over ground and the heading rate are from a camera's poses, its speeds, or a lidar, or from poses of the
-    body, none where these pause or jump.
+    Speeds over ground and the heading rate are from a camera's poses, its speeds, or a lidar, or, where there are none
+    of these, from the stream ``outside``: poses, none where these pause or jump, or GNSS.  ``time_s`` is the clock.
     """
     direct = [("imu", "gyro_z_radps", GYRO)] + [("imu", "accel_x_mps2", ACCEL)] * has_tilt
-    if by_pose:
-        seen = travelled(run, robot)
-        step_s, inside = np.diff(seen.time_s), np.diff(seen.part) == 0
-        rates = np.where(inside[:, None], np.diff(seen.values, axis=0), np.nan) / step_s[:, None]
+    if outside == "gnss":
+        for channel, rates in zip((SPEED_X, HEADING), _gnss_motion(run, robot), strict=True):
+            yield channel, run.streams["gnss"].time_s, rates
+    if outside == "pose":
+        # over the clock's own periods: stamps of poses may be close to each other, and their sums stay right
+        seen, half_s = travelled(run, robot), 0.5 * (time_s[1] - time_s[0])
+        edges_s = np.append(time_s - half_s, time_s[-1] + half_s)
+        at = np.column_stack([np.interp(edges_s, seen.time_s, column) for column in seen.values.T])
+        before = np.searchsorted(seen.time_s, edges_s[:-1], side="right") - 1
+        after = np.searchsorted(seen.time_s, edges_s[1:], side="left")
+        inside = (before >= 0) & (after < len(seen.time_s))
+        inside[inside] = seen.part[before[inside]] == seen.part[after[inside]]
+        rates = np.where(inside[:, None], np.diff(at, axis=0), np.nan) / (2.0 * half_s)
         for channel, rate in zip((SPEED_X, SPEED_Y, HEADING), rates.T, strict=True):
-            yield channel, seen.time_s[:-1] + 0.5 * step_s, rate
+            yield channel, time_s, rate
     camera = run.streams.get("odometry")
     if camera is not None and set(CAMERA_CHANNELS) <= set(camera.channels):
         speed = body_motion(camera, robot.camera).speed_mps

@@ -35,7 +35,8 @@ from terrain.effects import (
     vector_of,
 )
 from terrain.errors import DataError
-from terrain.records import Label, Stream
+from terrain.logs.schema import POSE_CHANNELS
+from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.plants.planar import Ground, replay, spread_numbers
 from terrain.simulation.run import simulate
@@ -397,3 +398,58 @@ def test_the_start_of_a_short_run_is_kept_where_it_begins_in_steady_motion(secon
     rows = rows_of(cut, Simulation(HUSKY).planar_on(""), vector_of({}), (), low_pass)
     centre_s = low_pass.taps.size // 2 * cut.dt_s * max(low_pass.inputs_every, 1)
     assert rows.time_s[0] == pytest.approx(centre_s + lost_s, abs=1.0 / low_pass.rate_hz)
+
+
+def arc(robot="husky", speed=0.6, rate=0.3, seconds=12.0):
+    """Return a run on a circle, its wheel speeds and nothing else, and its poses (n, 3) at 50 Hz."""
+    time_s = np.arange(0.0, seconds, 0.02)
+    half = 0.5 * HUSKY.track_m * rate
+    wheels = Stream(time_s, np.tile([speed - half, speed + half], (len(time_s), 1)), HUSKY.rate_channels)
+    yaw = rate * time_s
+    pose = np.column_stack([speed / rate * np.sin(yaw), speed / rate * (1 - np.cos(yaw)), yaw])
+    return RunLog("a", robot, {"wheels": wheels}), pose
+
+
+def seen_by(run, name, stream):
+    signals = signals_of(replace(run, streams={**run.streams, name: stream}), HUSKY)
+    means = (
+        np.nanmean(channel(signals, c))
+        for c in (SPEED_X, SPEED_Y, HEADING)
+        if np.isfinite(channel(signals, c)).any()
+    )
+    return [round(float(mean), 3) for mean in means]
+
+
+@pytest.mark.parametrize("speed", [0.6, -0.6])
+def test_poses_alone_give_speeds_and_heading_rate_of_any_drive(speed):
+    """Stamps of poses that come in pairs, some microseconds apart, are sums over the clock's periods."""
+    run, pose = arc(speed=speed)
+    time_s = run.streams["wheels"].time_s
+    at = np.sort(np.concatenate([time_s, time_s[1:] - 1e-5]))
+    columns = [np.interp(at, time_s, column) for column in pose.T]
+    jitter = np.random.default_rng(0).normal(size=(len(at), 3)) * 1e-4
+    found = seen_by(run, "pose", Stream(at, np.column_stack(columns) + jitter, POSE_CHANNELS))
+    assert found == [speed, 0.0, 0.3]
+
+
+@pytest.mark.parametrize("speed", [0.6, -0.6])
+@pytest.mark.parametrize("with_velocity", [True, False])
+def test_gnss_alone_gives_speed_and_the_rate_of_the_course(speed, with_velocity):
+    run, pose = arc(speed=speed)
+    rows = slice(None, None, 10)
+    time_s, place = run.streams["wheels"].time_s[rows], pose[rows, :2]
+    values, channels = place, ("position_x_m", "position_y_m")
+    if with_velocity:
+        values = np.column_stack([values, speed * np.cos(pose[rows, 2]), speed * np.sin(pose[rows, 2])])
+        channels = (*channels, "velocity_x_mps", "velocity_y_mps")
+    found = seen_by(run, "gnss", Stream(time_s, values, channels))
+    assert np.allclose(found, [speed, 0.3], atol=2e-3)
+
+
+def test_the_course_of_a_robot_at_rest_is_no_heading():
+    run, pose = arc(speed=0.1)
+    rows = slice(None, None, 10)
+    stream = Stream(run.streams["wheels"].time_s[rows], pose[rows, :2], ("position_x_m", "position_y_m"))
+    signals = signals_of(replace(run, streams={**run.streams, "gnss": stream}), HUSKY)
+    assert not np.isfinite(channel(signals, HEADING)).any()
+    assert np.isfinite(channel(signals, SPEED_X)).any()
