@@ -44,6 +44,8 @@ class Settings(ExplainOptions, AlignedRunsSettings):
     robot: str = setting(..., "Robot whose simulation is tested: name or YAML file.")
     out: Path = setting(..., "Folder of the page and of the extended robot.")
     model: str | None = setting(None, "Extended description of that robot, tested in its place.")
+    against: Path | None = setting(None)
+    """Folder of other runs of the robot: what changed from --data to them, as tyres, a load, or the floor."""
     pictures: str = setting("6", pattern="^([0-9]+|all)$")
     """Most runs that the page draws: a number, or 'all'."""
 
@@ -59,7 +61,13 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
     from terrain.files.atomic import atomic_write, ensure_writable
     from terrain.robots import load_robot
 
+    if settings.against is not None and settings.against.resolve() == settings.data.resolve():
+        raise ConfigError("--against is the folder of --data; a set of runs does not differ from itself")
     runs, skipped = load(settings)
+    others: list[RunLog] = []
+    if settings.against is not None:
+        others, more = load(settings.model_copy(update={"data": settings.against, "only": (), "without": ()}))
+        skipped = [*skipped, *more]
     out, model = settings.out, settings.model
     robot = tested = load_robot(settings.robot)
     if model is not None:
@@ -75,7 +83,14 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
     description = model or settings.robot
     options = settings.model_dump(include=set(ExplainOptions.model_fields))
     found = explain(
-        runs, tested, data=settings.dataset, description=description, progress=progress, **options
+        runs,
+        tested,
+        data=settings.dataset,
+        description=description,
+        progress=progress,
+        against=others or None,
+        against_data=settings.against.resolve().name if settings.against else "",
+        **options,
     )
     result = replace(
         found,
@@ -108,6 +123,8 @@ def explain(
     data: str = "",
     description: str | None = None,
     progress: Progress | None = None,
+    against: Iterable[RunLog] | None = None,
+    against_data: str = "",
     **options: Any,
 ) -> ExplainResult:
     """Return what the simulation of a robot gets wrong about its runs, extend it, and measure the gain.
@@ -119,6 +136,7 @@ def explain(
     data : name of the data set, for the report
     description : of the robot, for the report and the suggested command; its name by default
     progress : called with steps that are done
+    against : other runs of the robot, and the name of that data set: what changed from ``runs`` to them
     options : fields of :class:`ExplainOptions`, as ``hold_out`` or ``terrain``
 
     Returns
@@ -159,6 +177,13 @@ def explain(
     progress("diagnose", 1, 1)
     gained = held_out_gain(diagnosed, robot, seed)
     progress("gain", 1, 1)
+    compared_sets = None
+    if against is not None:
+        from terrain.discrepancy.against import compare_with
+
+        others = chosen_runs(list(against), robot, asked.terrain)
+        compared_sets = compare_with(diagnosed, robot, others, library, seed)
+        progress("against", 1, 1)
     diagnosis, extended = diagnosed.diagnosis, robot
     if diagnosed.extended is not None and asked.classifier and diagnosed.held_out:
         from pipelines.explain.classifier import classifier_gain
@@ -195,5 +220,7 @@ def explain(
                 terrains_apart(diagnosis.differing_channels, diagnosed.compared),
             ),
         ),
+        against=compared_sets,
+        against_data=against_data,
         powertrain=powertrain_of(chosen, robot, diagnosis.faults, seed),
     )

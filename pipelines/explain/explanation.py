@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.explain import figures
+from pipelines.explain.against import against_parts, against_text
 from pipelines.explain.statements import (
     Statement,
     effect_label,
@@ -22,6 +23,7 @@ from pipelines.report.numbers import enumerated, format_value, sentence
 from pipelines.report.results import Result, as_json, described
 from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, Text
 from pipelines.report.versions import versions
+from terrain.discrepancy.against import Against
 from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, example_stretch, telling_runs
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns, HeldOutGain
 from terrain.discrepancy.powertrain import Powertrain
@@ -71,6 +73,8 @@ class ExplainResult(Result, eq=False):
     notes: tuple[str, ...] = described("what a reader has to know of the terrains and sessions")
     next_command: str | None = described("simulates the next drive; null where none is suggested")
     powertrain: Powertrain | None = described("from commanded to measured wheel speeds, where logged")
+    against: Against | None = described("what changed to another set of runs", default=None)
+    against_data: str = described("name of that data set", default="")
     model: str | None = described("extended description tested; null for the robot's own", default=None)
     skipped: tuple[str, ...] = described("a sentence for each run that could not be read", default=())
     page: Path | None = described("page that was written", default=None)
@@ -129,11 +133,12 @@ def report(result: ExplainResult) -> Report:
         there = measured_channels([stretch])
         stated = [each.channel for each in result.statements if each.channel in there and each.differs]
         picture = figures.run_figure(stretch, runs.noise, (stated or there)[:PICTURED])
+    answer = [verdict_text(diagnosis), gain_text(result.gain.gain), *learned_texts(runs.learned_gains)]
+    if result.against is not None:
+        answer.insert(0, against_text(result.against, result.against_data or "the other runs"))
     written = Report(
         title=f"What the simulation of {diagnosis.robot} gets wrong",
-        answer=" ".join(
-            [verdict_text(diagnosis), gain_text(result.gain.gain), *learned_texts(runs.learned_gains)]
-        ),
+        answer=" ".join(answer),
         picture=picture,
         parts=[*_decisive_parts(result)],
         details=[section for section in _details(result) if section.parts],
@@ -289,6 +294,9 @@ def _open_parts(diagnosis: Diagnosis) -> Iterator[Part]:
 def _details(result: ExplainResult) -> Iterator[Section]:
     """Yield all that the answer rests on; sections may be empty."""
     diagnosis, runs = result.diagnosis, result.diagnosed
+    if result.against is not None:
+        name = result.against_data or "the other runs"
+        yield Section(f"What changed to {name}", [*against_parts(result.against, name, result.robot)])
     statements = [tuple(each.text.split(": ", 1)) for each in result.statements]
     yield Section("Channel by channel", [Pairs(statements)])
     yield Section("Verdict and gain, channel by channel", [*_gain_parts(diagnosis, result.gain)])

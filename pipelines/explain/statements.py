@@ -292,7 +292,8 @@ def varying_text(effect: Varying) -> str:
         text = f"The {name} {'rises' if rises else 'falls'} by {by} at one point of the order of the runs, {first}: "
         text += f"{' and '.join(parts)}."
     elif parts:
-        between = "sessions" if effect.pattern is Kind.SESSIONS else "two groups of runs"
+        named = {Kind.SESSIONS: "sessions", Kind.TERRAINS: "terrains"}
+        between = named.get(effect.pattern, "two groups of runs")
         text = f"The {name} differs between {between} by {by}: {enumerated(parts)}."
     else:
         text = (

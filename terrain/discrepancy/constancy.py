@@ -302,9 +302,12 @@ class RunValues(NamedTuple):
 
     def in_pattern(self, signals: Sequence[Signals]) -> RunValues:
         """Return the same with the pattern of the values of these runs."""
-        place, sessions = np.array([run.place for run in signals]), [run.session for run in signals]
+        place, of = (
+            np.array([run.place for run in signals]),
+            ([r.session for r in signals], [r.terrain for r in signals]),
+        )
         place = place if np.isfinite(place).all() else np.arange(len(place), dtype=float)
-        return self._replace(pattern=pattern_of(self.value, self.variance, place, sessions))
+        return self._replace(pattern=pattern_of(self.value, self.variance, place, *of))
 
 
 class _OwnValues(NamedTuple):
@@ -370,7 +373,14 @@ def varying_effects(problem: Problem, fit: CauseFit) -> tuple[verdict.Varying, .
         (low, high), seen = PARAMETER[of.name].plausible, of.weight > 0
         value = info.vector[INDEX[of.name]] + of.value[seen]
         margin = OUT_STDS / np.sqrt(of.weight[seen]) + OUT_SCATTERS * of.scatter
-        if np.mean((value < low - margin) | (value > high + margin)) <= OUT_RATIO:
+        believed = PARAMETER[of.name].plausible
+        inside = True
+        if (
+            columns.size and of.pattern is not None
+        ):  # parts of the runs are of a size that a builder would believe
+            parts = info.vector[INDEX[of.name]] + of.pattern.values[seen]
+            inside = bool(believed[0] <= parts.min() and parts.max() <= believed[1])
+        if inside and np.mean((value < low - margin) | (value > high + margin)) <= OUT_RATIO:
             near.append((own, linear))
     if not near:
         return ()
@@ -515,7 +525,7 @@ def _in_words(of: RunValues, signals: Sequence[Signals], channel: str) -> tuple[
         return (), channel, found.kind, *found.at(np.array([0.0, span])), round(span) + 1
     # of two groups the smaller value first, of a change what was before, of a rogue the others
     order, groups = range(len(found.coefficients)), []
-    if found.kind in (Kind.GROUPS, Kind.SESSIONS):
+    if found.kind in (Kind.GROUPS, Kind.SESSIONS, Kind.TERRAINS):
         order = np.argsort(found.coefficients, kind="stable").tolist()
     for k in order:
         mine = np.flatnonzero((found.columns[:, k] > 0) & np.isfinite(of.variance))

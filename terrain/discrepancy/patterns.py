@@ -32,6 +32,15 @@ SCATTERS = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 40)])
 """Scatters that are tried, over the range of the values."""
 
 
+APART = 3.0
+"""Groups are apart by that times the scatter in either at the least: the tail of a law is no group, nor is half of a
+normal one: its halves are apart by 2.7."""
+
+ROGUE_TAIL_DOF, ROGUE_P = 4.0, 0.01
+"""A rogue run is improbable even where runs scatter with Student's distribution of so many degrees, as measured ones
+do: by less than that probability, all runs together."""
+
+
 class Kind(StrEnum):
     """How a value differs from run to run."""
 
@@ -40,6 +49,7 @@ class Kind(StrEnum):
     CHANGE = "change"  #: one value up to a run, and another from the next
     GROUPS = "groups"  #: one of two values
     SESSIONS = "sessions"  #: one value a session
+    TERRAINS = "terrains"  #: one value a terrain
     ROGUE = "rogue"  #: one run has another value than the rest
 
 
@@ -65,14 +75,16 @@ class Pattern(NamedTuple):
         return value, (value - half, value + half)
 
 
-def pattern_of(value: Array, variance: Array, place: Array, session: Sequence[str]) -> Pattern | None:
+def pattern_of(
+    value: Array, variance: Array, place: Array, session: Sequence[str], terrain: Sequence[str] = ()
+) -> Pattern | None:
     """Return the pattern with the greatest evidence; None for too few runs, or values that do not differ.
 
     Parameters
     ----------
     value, variance : (n,) by run, the variance by the noise infinite where a run shows nothing
     place : (n,) of the runs in their order
-    session : (n,) of the runs by name, empty where that is not known
+    session, terrain : (n,) of the runs by name, empty where that is not known
 
     Examples
     --------
@@ -103,25 +115,61 @@ def pattern_of(value: Array, variance: Array, place: Array, session: Sequence[st
         left = 1.0 - square / (weight @ off**2)
         k = int(np.argmin(0.5 * n * np.log(np.maximum(left, 1e-12)) + log_choices))
         designs.append((kind, np.column_stack([~second[k], second[k]]).astype(float), float(log_choices[k])))
-    names = sorted(set(session))
-    if (
-        len(names) > 1
-        and min([sum(known[i] for i, own in enumerate(session) if own == name) for name in names]) >= MIN_SIDE
-    ):
-        designs.append(
-            (Kind.SESSIONS, np.array([[own == name for name in names] for own in session], float), 0.0)
-        )
+    for kind, named in ((Kind.SESSIONS, session), (Kind.TERRAINS, terrain)):
+        of = np.array([[own == name for name in sorted(set(named))] for own in named], dtype=float)
+        if len(named) and of.shape[1] > 1 and of[known].sum(axis=0).min() >= MIN_SIDE:
+            designs.append((kind, of, 0.0))
     best: Pattern | None = None
     for kind, columns, log_choice in designs:
-        own_loss, coefficients, cov, _ = _fit(v, s2, columns[known])
-        more, dof = columns.shape[1] - 1, n - columns.shape[1]
-        ratio = max(loss - own_loss, 0.0) / n
-        log_p = float(fisher.logsf(math.expm1(min(ratio, 500.0)) * dof / more, more, dof))
-        # where that underflows: far out the tail falls with this power
-        z = z_of(min(max(log_p, -0.5 * dof * ratio - 50.0) + log_choice, 0.0))
+        own_loss, coefficients, cov, own_weight = _fit(v, s2, columns[known])
+        if kind in (Kind.GROUPS, Kind.ROGUE) and not _is_apart(
+            kind, v, columns[known], coefficients, own_weight
+        ):
+            continue
+        z = _z_of_losses(loss, own_loss, n, columns.shape[1], log_choice)
         if best is None or z > best.z:
-            best = Pattern(kind, z, columns, coefficients, cov, dof)
+            best = Pattern(kind, z, columns, coefficients, cov, n - columns.shape[1])
     return best
+
+
+def evidence_of_parts(value: Array, variance: Array, second: Array) -> float:
+    """Return the evidence that runs (n,) of a second part have another value than the others, as a normal number.
+
+    Examples
+    --------
+    >>> second = np.arange(12) % 2 > 0
+    >>> evidence_of_parts(second + 0.1 * np.sin(np.arange(12.0)), np.full(12, 1e-4), second) > 4.5
+    True
+    """
+    known = np.isfinite(variance)
+    parts = np.column_stack([~second[known], second[known]]).astype(float)
+    if known.sum() < MIN_RUNS or parts.sum(axis=0).min() < MIN_GROUP or not np.ptp(value[known]) > 0.0:
+        return 0.0
+    losses = [
+        _fit(value[known], variance[known], columns)[0] for columns in (parts.sum(axis=1)[:, None], parts)
+    ]
+    return _z_of_losses(losses[0], losses[1], int(known.sum()), 2, 0.0)
+
+
+def _z_of_losses(none: float, own: float, n: int, n_columns: int, log_choices: float) -> float:
+    """Return the evidence of a design of n runs over one value, as a standard normal number."""
+    more, dof, ratio = n_columns - 1, n - n_columns, max(none - own, 0.0) / n
+    log_p = float(fisher.logsf(math.expm1(min(ratio, 500.0)) * dof / more, more, dof))
+    # where that underflows: far out the tail falls with this power
+    return z_of(min(max(log_p, -0.5 * dof * ratio - 50.0) + log_choices, 0.0))
+
+
+def _is_apart(kind: Kind, value: Array, columns: Array, coefficients: Array, weight: Array) -> bool:
+    """Return whether two parts of runs are further apart than the tail of one law is from the rest."""
+    left, change = value - columns @ coefficients, abs(float(coefficients[1] - coefficients[0]))
+    if kind is Kind.ROGUE:
+        rest = columns[:, 0] > 0
+        scatter = math.sqrt(float(np.mean(left[rest] ** 2)))
+        size = change / max(scatter, 1.0 / math.sqrt(float(weight[~rest][0])))
+        return 2.0 * len(value) * float(student.sf(size, ROGUE_TAIL_DOF)) < ROGUE_P
+    n = columns.sum(axis=0)
+    scatters = np.sqrt((columns * left[:, None] ** 2).sum(axis=0) / np.maximum(n - 1.0, 1.0))
+    return change > APART * float(scatters.max())
 
 
 def _fit(value: Array, variance: Array, columns: Array) -> tuple[float, Array, Array, Array]:

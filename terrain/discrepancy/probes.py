@@ -135,6 +135,23 @@ def probe_residuals(
     return results
 
 
+def input_values(info: Evidence, c: int) -> dict[str, tuple[Array, Array]]:
+    """Return by input how much the residual of a channel depends on it in each run (runs,), and the information.
+
+    What varies from run to run is taken out; the information is 0 where a run shows nothing.
+    """
+    rate_hz = 1 / float(np.median(np.diff(info.rows[0].time_s)))
+    inputs, products = [probe_inputs(run, rate_hz) for run in info.rows], []
+    for i, own in enumerate(inputs):
+        columns = _whitened(info, i, c, np.array([*own.values()]))
+        products.append(_products(info, i, c, [], columns, (0, columns.shape[1]))[0])
+    every = np.array(products)
+    size, score = np.diagonal(every, axis1=1, axis2=2)[:, :-1], every[:, :-1, -1]
+    known = size > 1e-9 * np.maximum(size.max(axis=0), 1e-30)
+    value, size = np.where(known, score / np.where(known, size, 1.0), 0.0), np.where(known, size, 0.0)
+    return {name: (value[:, k], size[:, k]) for k, name in enumerate(inputs[0])}
+
+
 def _whitened(info: Evidence, i: int, c: int, columns: Array) -> Array:
     """Whiten columns (q, m) of a run as channel c, 0 where its residual is not known."""
     scaled = columns / info.noise.size(info.rows[i].pace_mps)[:, c]

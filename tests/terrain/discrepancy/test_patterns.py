@@ -49,6 +49,12 @@ def test_values_that_differ_at_random_have_no_pattern(n, noise):
     assert max(z) < 4.5
 
 
+def test_a_terrain_at_the_end_of_the_order_is_a_terrain_and_no_change():
+    terrain = ["asphalt"] * 13 + ["sand"] * 7
+    value = 0.003 * np.random.default_rng(0).standard_normal(N) + 0.05 * (PLACE >= 13)
+    assert pattern_of(value, np.full(N, 1e-6), PLACE, NO_SESSION, terrain).kind is Kind.TERRAINS
+
+
 def test_few_runs_or_values_that_are_all_alike_have_no_pattern():
     assert pattern_of(PLACE[:5], np.ones(5), PLACE[:5], [""] * 5) is None
     assert pattern_of(np.zeros(N), np.ones(N), PLACE, NO_SESSION) is None
