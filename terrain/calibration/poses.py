@@ -280,6 +280,13 @@ def fit_poses(
     return PoseFit(chosen, fit, usual, n_legs, int(block.max()) + 1)
 
 
+def leg_errors(runs: Sequence[RunLog], robot: Robot, values: Mapping[str, float]) -> Array:
+    """Return measured minus simulated change of pose (legs, 3) of runs at values of parameters, 0 of the others."""
+    planar, vector = make_planar(robot, FIRM), vector_of(values)
+    found = [legs_of(run, robot) for run in runs]
+    return np.concatenate([legs.moved - simulated(legs, planar, vector) for legs in found])
+
+
 def _blocks(found: Sequence[Legs], leg_s: float, n_legs: int) -> Array:
     """Return the number of the cluster of each leg: blocks of time, none over two runs."""
     length = max(min(n_legs // BLOCKS, round(LONGEST_BLOCK_S / leg_s) * STRIDES), 2 * STRIDES)
