@@ -1,0 +1,190 @@
+"""What ``terrain explain`` states of measured sets, and whether a label changes it.
+
+Each set is explained without a label, under the soil that it was driven on, under another soil, and under a word that
+is no soil.  The names have to be the same, unless its runs were simulated on a soil since data held out are predicted
+better on it; and what is named has to gain on data held out, at least half of what the learner does.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pipelines.data.datasets import load_runs
+from pipelines.report.results import Progress, Result, described, silent
+from pipelines.report.settings import Names, setting
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.tree import Column, Report, Table
+from terrain.discrepancy.gain import HALF
+from terrain.errors import ConfigError, DataError
+from terrain.records import Label, RunLog
+
+EXAMPLE = "python tests/studies real-sets --data ~/sets --sets marmotte,borealtc-SNOW"
+FOREIGN = "zork"  #: A label that is no soil
+OTHER_THAN = {"grass": "asphalt"}  #: Another soil than that, grass of all others
+
+
+class Source(NamedTuple):
+    """A set: its folder, the robot, the label of the runs that are taken, and the soil that they were driven on."""
+
+    folder: str
+    robot: str
+    terrain: str | None
+    soil: str
+
+
+SETS = {
+    "marmotte": Source("drive_marmotte", "marmotte", None, "snow"),
+    "husky": Source("drive_husky", "husky", None, "snow"),
+    "husky-wet-grass": Source("drive_recordings/husky_wet_grass", "husky", None, "grass"),
+    "warthog-grass": Source("drive_recordings/warthog_grass", "warthog", None, "grass"),
+    "warthog-asphalt": Source("drive_recordings/warthog_asphalt", "warthog", None, "asphalt"),
+    "warthog": Source("drive_warthog_terrains", "warthog", None, "asphalt"),
+    **{
+        f"borealtc-{name}": Source("borealtc", "husky", name, soil)
+        for name, soil in (
+            ("ASPHALT", "asphalt"),
+            ("FLOORING", "tiles"),
+            ("ICE", "snow"),
+            ("SANDY_LOAM", "tilled_loam"),
+            ("SNOW", "snow"),
+        )
+    },
+    **{
+        f"vulpi-{name}": Source("vulpi", "husky", name, soil)
+        for name, soil in (
+            ("CONCRETE", "asphalt"),
+            ("PLOUGHED", "tilled_loam"),
+            ("UNPLOUGHED", "firm_soil_gravel"),
+        )
+    },
+    **{
+        f"robotino-{name}": Source("robotino/one_surface", "robotino", name, "tiles")
+        for name in ("table", "brown", "gray", "green")
+    },
+}
+
+
+class Settings(BaseSettings):
+    """Which sets, under which labels."""
+
+    data: Path = setting(Path(os.environ.get("TERRAIN_DATA", ".")), "Folder of the measured sets.")
+    sets: Names = setting(tuple(SETS), "Sets, by commas.")
+    labels: Names = setting(("none", "own", "other", "foreign"), "Labels that the runs are given, by commas.")
+    every: int = setting(1, "Of the runs each so many-th is taken: 2 takes half.", ge=1)
+
+
+class Row(NamedTuple):
+    """What is stated of a set under a label."""
+
+    name: str
+    label: str
+    soil: str  #: on which the runs were simulated; empty for the default ground
+    causes: str  #: with their values
+    names: tuple[str, ...]  #: named, and sets
+    gain: float  #: on data held out
+    gain_ci: tuple[float, float]
+    learner_gain: float
+    tiers: str  #: by channel
+    cpu_s: float
+
+
+class RealSets(Result):
+    """What is stated of measured sets under labels."""
+
+    rows: tuple[Row, ...] = described("a row a set and label")
+    changed: tuple[str, ...] = described("sets of which a label changes names without a better ground")
+    not_earned: tuple[str, ...] = described("sets with names whose gain is under its bars")
+
+
+def relabelled(runs: Sequence[RunLog], label: str) -> list[RunLog]:
+    """Return runs with one label throughout, or none for the empty one."""
+    out = []
+    for run in runs:
+        times = [stream.time_s[[0, -1]] for stream in run.streams.values()]
+        ends = float(np.min(times)), float(np.max(times))
+        out.append(replace(run, labels=(Label(*ends, label),) if label else ()))
+    return out
+
+
+def explain_set(name: str, label: str, runs: Sequence[RunLog]) -> Row:
+    """Return what is stated of runs of a set under a label."""
+    import terrain
+
+    soil = SETS[name].soil
+    given = {"none": "", "own": soil, "other": OTHER_THAN.get(soil, "grass"), "foreign": FOREIGN}[label]
+    start_s = time.process_time()
+    try:
+        result = terrain.explain(relabelled(runs, given), SETS[name].robot)
+    except DataError as error:
+        return Row(name, label, "", str(error), (), np.nan, (np.nan, np.nan), np.nan, "", np.nan)
+    found, gain = result.diagnosis, result.diagnosis.gain
+    causes = [
+        f"{cause.name} {', '.join(f'{value.value:.3g}' for value in cause.parameters)}"
+        for cause in found.causes
+    ]
+    sets = [f"one of {', '.join(sorted(names))}" for names in found.ambiguous_sets]
+    return Row(
+        name,
+        label,
+        ", ".join(match.soil for match in result.diagnosed.terrains if match.soil),
+        "; ".join([*causes, *sets]),
+        tuple(sorted([*[cause.name for cause in found.causes], *sets])),
+        *((gain.reduction, gain.ci, gain.learner_reduction) if gain else (np.nan, (np.nan, np.nan), np.nan)),
+        "; ".join(f"{one.channel} {one.tier.value if one.tier else 'agrees'}" for one in found.channels),
+        time.process_time() - start_s,
+    )
+
+
+def run(settings: Settings, progress: Progress = silent) -> RealSets:
+    """Explain sets under labels."""
+    if unknown := [name for name in settings.sets if name not in SETS]:
+        raise ConfigError(f"there is no set {unknown[0]!r}; there are {', '.join(SETS)}")
+    if unknown := [label for label in settings.labels if label not in ("none", "own", "other", "foreign")]:
+        raise ConfigError(f"--labels has {unknown[0]!r}; none, own, other and foreign are accepted")
+    rows: list[Row] = []
+    for name in settings.sets:
+        of = SETS[name]
+        runs = list(load_runs(settings.data / of.folder, robot=of.robot))
+        runs = [run for run in runs if of.terrain is None or run.terrains == (of.terrain,)][:: settings.every]
+        for label in settings.labels:
+            rows.append(explain_set(name, label, runs))
+            progress("sets", len(rows), len(settings.sets) * len(settings.labels))
+    first = {row.name: row for row in reversed(rows)}
+    changed = [
+        f"{row.name} {row.label}" for row in rows if row.names != first[row.name].names and not row.soil
+    ]
+    named = [row for row in rows if row.names]
+    weak = [row for row in named if not (row.gain_ci[0] > 0.0 and row.gain >= HALF * row.learner_gain)]
+    return RealSets(tuple(rows), tuple(changed), tuple(f"{row.name} {row.label}" for row in weak))
+
+
+def report(result: RealSets) -> Report:
+    """Return what is stated, and where a label changes it."""
+    columns = (
+        Column("set", of="name"),
+        Column("label", of="label"),
+        Column("soil", of="soil"),
+        Column("causes", of="causes"),
+        Column("gain", ".0%", of="gain"),
+        Column("95 %", ".0%", of="gain_ci"),
+        Column("learner", ".0%", of="learner_gain"),
+        Column("channels", of="tiers"),
+        Column("CPU", ".0f", "s", of="cpu_s"),
+    )
+    answer = (
+        f"A label changes names without a better ground in {len(result.changed)} of {len(result.rows)} results; of "
+        f"{len(result.not_earned)} results with names the gain is under its bars."
+    )
+    note = "; ".join(
+        f"{text}: {', '.join(names)}"
+        for text, names in (("changed", result.changed), ("not earned", result.not_earned))
+        if names
+    )
+    return Report("Measured sets under labels", answer, parts=(Table(columns, result.rows, note=note),))
