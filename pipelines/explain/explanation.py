@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,27 +15,30 @@ from pipelines.explain.statements import (
     effect_label,
     gain_text,
     in_words_of,
-    learned_texts,
+    percent_text,
     varying_text,
-    verdict_text,
     would_have_shown,
 )
-from pipelines.report.numbers import enumerated, format_value, sentence
+from pipelines.report.numbers import enumerated, format_value, plural, sentence
 from pipelines.report.results import Result, as_json, described
 from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, Text
 from pipelines.report.versions import versions
 from terrain.discrepancy.against import Against
-from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, example_stretch, telling_runs
+from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, example_stretch, off_by, telling_runs
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns, HeldOutGain
 from terrain.discrepancy.powertrain import Powertrain
-from terrain.discrepancy.robot_terms import limit_text, quantity, quantity_interval, values_with_intervals
+from terrain.discrepancy.robot_terms import (
+    in_robot_terms,
+    limit_text,
+    quantity,
+    quantity_interval,
+    value_in_robot_terms,
+    values_with_intervals,
+)
 from terrain.discrepancy.runs import measured_channels
-from terrain.discrepancy.verdict import Diagnosis
-from terrain.effects import PARAMETER, effect_named
+from terrain.discrepancy.verdict import Cause, ChannelVerdict, Diagnosis, Tier
+from terrain.effects import GYRO, HEADING, PARAMETER, effect_named
 from terrain.robots import Robot
-
-PICTURED = STATED = 3
-"""Channels of the first picture, and of the sentences beside the answer: those of which most is stated."""
 
 ERROR_LABELS = {
     "speed_mps": ("speed, root mean square", "m/s"),
@@ -128,24 +132,184 @@ def report(result: ExplainResult) -> Report:
     held_out = f"{len(runs.held_out)} held out" if runs.held_out else ""
     lead = f"{diagnosis.n_runs} runs compared", held_out, result.data, result.terrain
     picture = None
-    if shown := runs.judged or runs.compared:  # held-out runs where there are any
+    if shown := runs.whole or runs.compared:  # held-out runs where there are any
         stretch = example_stretch(shown, runs.noise)
         there = measured_channels([stretch])
-        stated = [each.channel for each in result.statements if each.channel in there and each.differs]
-        picture = figures.run_figure(stretch, runs.noise, (stated or there)[:PICTURED])
-    answer = [verdict_text(diagnosis), gain_text(result.gain.gain), *learned_texts(runs.learned_gains)]
+        of = [each.channel for each in channels_that_matter(result) if each.channel in there]
+        picture = figures.run_figure(stretch, runs.noise, (of or there)[:1])
+    answer = answer_of(result)
     if result.against is not None:
-        answer.insert(0, against_text(result.against, result.against_data or "the other runs"))
+        answer = f"{against_text(result.against, result.against_data or 'the other runs')} {answer}"
     written = Report(
         title=f"What the simulation of {diagnosis.robot} gets wrong",
-        answer=" ".join(answer),
+        answer=answer,
         picture=picture,
-        parts=[*_decisive_parts(result)],
+        parts=[five_questions(result), *_decisive_parts(result)],
         details=[section for section in _details(result) if section.parts],
         lead=" · ".join(filter(None, lead)),
     )
     worded: Report = in_words_of(result.robot.drive, written)
     return replace(worded, next_step=result.next_command or "")
+
+
+# -- The first screen: one sentence, and the five questions that a reader comes with ------------------------
+
+BY_SENSOR = {GYRO: "gyro", HEADING: "heading"}  #: That measure the same motion
+
+STATED = 3  #: Channels, causes or candidates that an answer lists
+NAMELESS = (Tier.CANDIDATE, Tier.UNEXPLAINED)
+
+
+def channels_that_matter(result: ExplainResult) -> list[ChannelVerdict]:
+    """Return the channels in which something is off, that of which most can be removed first."""
+    off = [of for of in result.diagnosis.channels if of.tier is not None and of.tier is not Tier.NOT_SHOWN]
+    before = result.diagnosis.residual_before
+
+    def removed(of: ChannelVerdict) -> float:
+        """Return the square that is or can be removed, over that of the noise."""
+        part = max([x for x in (of.gain, of.learner_gain, 0.0) if math.isfinite(x)])
+        noise = before[of.channel].noise if of.channel in before else math.nan
+        return part * (of.rms_before / noise) ** 2 if noise > 0.0 else part
+
+    return sorted(off, key=lambda of: (of.tier not in (Tier.NAMED, Tier.SET), -removed(of)))
+
+
+def answer_of(result: ExplainResult) -> str:
+    """Return what is wrong and what that is worth, in one sentence in the words of who built the robot."""
+    robot, channels = result.diagnosis.robot, channels_that_matter(result)
+    if not channels:
+        return f"These runs show nothing that the simulation of {robot} gets wrong."
+    first = channels[0]
+    name, unit = CHANNEL_WORDS[first.channel]
+    what = _off(result, first)
+    causes = [cause for cause in result.diagnosis.built_in if cause.name in first.causes]
+    if not causes or not first.gain > 0.0:
+        learner = f"a learner without names removes {percent_text(first.learner_gain)} of its square"
+        return f"{_capital(what)}, and no cause could be named for it: {learner}."
+    terms = enumerated([_terms(cause, result) for cause in causes[:STATED]])
+    one_of = " (or what looks the same)" if any(cause.tier is Tier.SET for cause in causes) else ""
+    how = result.gain.gain.how
+    falls = f"the error of its {name} falls from {first.rms_before:.2g} to {first.rms_after:.2g} {unit}"
+    return f"{_capital(what)}: with {terms}{one_of} {falls}, judged on {how}."
+
+
+def five_questions(result: ExplainResult) -> Pairs:
+    """Return what is wrong, why, how certain that is, what it gains, and what to do next."""
+    diagnosis, channels = result.diagnosis, channels_that_matter(result)
+    wrong = [_off(result, of) for of in channels[:STATED]]
+    if len(channels) > STATED:
+        wrong.append(f"{plural(len(channels) - STATED, 'more channel')} below")
+    rows = [
+        ("What is wrong", _capital("; ".join(wrong)) or "Nothing that these runs show"),
+        ("Why", _why(result)),
+        ("How certain", _how_certain(result)),
+        ("What it gains", _gains(result)),
+        ("What next", next_text(result)),
+    ]
+    faults = [fault.sentence for fault in diagnosis.faults]
+    return Pairs([("Faults of the logs", "; ".join(faults)), *rows] if faults else rows)
+
+
+def _gains(result: ExplainResult) -> str:
+    """Return what the extension removes: with names, with what is learned beside them, and in the first channel."""
+    names, whole, parts = result.gain.gain, result.diagnosed.whole_gain, []
+    for first in channels_that_matter(result)[:1]:
+        if first.gain > 0.0 and len(result.diagnosis.channels) > 1:
+            interval = f"{percent_text(first.gain_ci[0], '')} to {percent_text(first.gain_ci[1])}"
+            of = f"the squared error of the {CHANNEL_WORDS[first.channel][0]}"
+            parts.append(f"{percent_text(first.gain)} ({interval}) of {of}")
+    if math.isfinite(names.reduction):
+        refused = ", which may be nothing" if names.refused else ""
+        interval = f"{percent_text(names.ci[0], '')} to {percent_text(names.ci[1])}"
+        parts.append(f"names remove {percent_text(names.reduction)} ({interval}) over all channels{refused}")
+    if whole.reduction > (names.reduction if math.isfinite(names.reduction) else 0.0):
+        beside = "with the learned terms" if math.isfinite(names.reduction) else "learned terms remove"
+        parts.append(f"{beside} {percent_text(whole.reduction)}")
+    parts.append(f"a black-box learner removes {percent_text(names.learner_reduction)}")
+    return f"On {names.how}: {'; '.join(parts)}"
+
+
+def _why(result: ExplainResult) -> str:
+    """Return what is named, what is one of several, what is learned without a name, and what has no name."""
+    diagnosis, parts = result.diagnosis, []
+    if diagnosis.causes:
+        parts.append(enumerated([_terms(cause, result) for cause in diagnosis.causes]))
+    for names in diagnosis.ambiguous_sets:
+        members = enumerated([effect_label(name) for name in names], "or")
+        built = [cause for cause in diagnosis.of_sets if cause.name in names]
+        as_one = f" (built in as {_terms(built[0], result)})" if built else ""
+        parts.append(f"one of {members}{as_one}")
+    parts += [varying_text(effect).removesuffix(".") for effect in diagnosis.varying]
+    learned = [
+        f"{term.says} ({CHANNEL_WORDS[term.channel][0]})" for term in result.diagnosed.with_terms.learned
+    ]
+    if learned:
+        parts.append(f"learned, since no name fits: {enumerated(learned)}")
+    nameless = [CHANNEL_WORDS[of.channel][0] for of in channels_that_matter(result) if of.tier in NAMELESS]
+    if nameless:
+        parts.append(f"no cause is named for {enumerated(nameless)}")
+    return "; ".join(parts) or "nothing is to be explained"
+
+
+def _how_certain(result: ExplainResult) -> str:
+    """Return the intervals of what is built in, the candidates, and what these drives could not have shown."""
+    diagnosis, parts = result.diagnosis, []
+    for cause in diagnosis.built_in:
+        tier = "" if cause.tier is Tier.NAMED else ", one of a set"
+        values = enumerated([value_in_robot_terms(*v[:2], *v[3:], result.robot) for v in cause.parameters])
+        parts.append(f"{effect_label(cause.name)} {values}{tier}")
+    if parts:
+        parts[0] = f"95 % intervals: {parts[0]}"
+    if diagnosis.candidates:
+        shown = enumerated([effect_label(each.name) for each in diagnosis.candidates[:STATED]])
+        more = f" and {n} more" if (n := len(diagnosis.candidates) - STATED) > 0 else ""
+        parts.append(f"candidates that did not earn a name and are not built in: {shown}{more}")
+    if n := len(diagnosis.not_shown):
+        parts.append(
+            f"{n} of {len(diagnosis.detection_limits)} parameters could not have been seen in these drives"
+        )
+    return "; ".join(parts) or "of all parameters, these drives would have shown any at a tenth of its range"
+
+
+def next_text(result: ExplainResult) -> str:
+    """Return what to do next: drive an experiment, use what was found, or neither."""
+    diagnosis, steps = result.diagnosis, []
+    if diagnosis.built_in:
+        steps.append("simulate and estimate with extended.yaml in place of the robot's file")
+    if coming := diagnosis.next_drive:
+        where = (
+            f"on a slope of {coming.grade_deg:g}°, up which it starts" if coming.grade_deg else "on the level"
+        )
+        steps.append(
+            f"drive next_drive.csv ({coming.duration_s:.0f} s of speeds and yaw rates, {where}, on a field of "
+            f"{coming.length_m:.0f} by {coming.width_m:.0f} m): {coming.reason}"
+        )
+    return "; ".join(steps) or "nothing is open that a drive of this robot would show"
+
+
+def _off(result: ExplainResult, of: ChannelVerdict) -> str:
+    """Return by how much a channel is off, in words of the motion where a factor or a level says it."""
+    for statement in result.statements:
+        if statement.channel == of.channel:
+            ratio, level = statement.measured_over_simulated, statement.measured_minus_simulated
+            if math.isfinite(ratio) or math.isfinite(level):
+                text = off_by(of.channel, ratio, level)
+                if of.channel in BY_SENSOR:
+                    return f"{text}, by the {BY_SENSOR[of.channel]}"
+                return text if "simulation" in text else f"{CHANNEL_WORDS[of.channel][0]}: {text}"
+    name, unit = CHANNEL_WORDS[of.channel]
+    return f"the simulated {name} is off by {of.rms_before:.2g} {unit} rms"
+
+
+def _terms(cause: Cause, result: ExplainResult) -> str:
+    return in_robot_terms(cause.name, cause.parameters, result.robot)
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+# -- What it rests on --------------------------------------------------------------------------------------
 
 
 def _ids(runs: Iterable[Any]) -> str:
@@ -155,13 +319,8 @@ def _ids(runs: Iterable[Any]) -> str:
 def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
     """Yield what a user decides by: faults, causes with intervals, rivals, and what was not detectable."""
     diagnosis = result.diagnosis
-    for fault in diagnosis.faults:
-        yield Text(f"{fault.heading}: {fault.sentence}", "warning")
     if diagnosis.excluded_runs:
         yield Text(f"Runs that were excluded as unfit: {_ids(diagnosis.excluded_runs)}.", "warning")
-    for statement in result.statements[:STATED]:  # what states something comes first
-        if statement.differs:
-            yield Text(sentence(statement.text))
     causes: list[tuple[Any, ...]] = []
     notes = ["Values are added to what the description has already."]
     for cause in diagnosis.built_in:
@@ -181,14 +340,9 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
         yield Table(heads, causes, note=" ".join(notes))
     for names in diagnosis.ambiguous_sets:
         yield _rivals(names, diagnosis)
-    for each in diagnosis.varying:
-        yield Text(varying_text(each))
     yield from _learned_parts(result.diagnosed)
     if (before := result.gain.built_in_before) is not None:
         yield Text(f"What the description has already: {gain_text(before)}")
-    if n := len(diagnosis.not_shown):
-        of = len(diagnosis.detection_limits)
-        yield Text(f"Of {of} parameters that may be wrong, {n} could not have been detected.")
     for note in result.notes:
         yield Text(note, "note")
     for skipped in result.skipped:
@@ -308,15 +462,6 @@ def _details(result: ExplainResult) -> Iterator[Section]:
         )
         stated = [*map(Text, powertrain.sentences), Text(given, "note")]
         yield Section("From commanded to measured wheel speeds", stated)
-    if coming := diagnosis.next_drive:
-        where = (
-            f"on a slope of {coming.grade_deg:g}°, up which it starts" if coming.grade_deg else "on the level"
-        )
-        why = (
-            f"{coming.duration_s:.0f} s of commands in next_drive.csv (speeds and yaw rate over time), {where}, on a "
-            f"field of {coming.length_m:.0f} by {coming.width_m:.0f} m: {coming.reason}. In simulation first:"
-        )
-        yield Section("What to drive next", [Text(why), Text(result.next_command or "", "code")])
     yield Section("What the residuals depend on", [*_dependence_parts(runs)])
     whole: Sequence[ComparedRun] = [*runs.compared, *(runs.judged if runs.held_out else ())]
     if result.n_pictures is not None:

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 from pipelines.report.numbers import enumerated
 from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, Slope, off_by, slopes_of
 from terrain.discrepancy.gain import Gain
-from terrain.discrepancy.learner import LearnedGain
 from terrain.discrepancy.patterns import Kind
 from terrain.discrepancy.robot_terms import UNITS, in_robot_terms, quantity, values_with_intervals
 from terrain.discrepancy.runs import TerrainMatch
@@ -175,35 +174,6 @@ def effect_label(effect: str) -> str:
     return effect.replace("_", " ")
 
 
-def verdict_text(diagnosis: Diagnosis) -> str:
-    """Return what the simulation gets wrong, with values and intervals."""
-    sentences = []
-    if diagnosis.causes:
-        causes = [
-            f"{effect_label(cause.name)}, {values_with_intervals(cause.parameters)}"
-            for cause in diagnosis.causes
-        ]
-        sentences.append(f"The simulation of {diagnosis.robot} lacks {enumerated(causes)}.")
-    for names in diagnosis.ambiguous_sets:
-        rivals = enumerated([effect_label(name) for name in names], "or")
-        sentences.append(f"One of {rivals} is present, and these runs cannot distinguish them.")
-        built = [cause for cause in diagnosis.of_sets if cause.name in names]
-        if built:
-            values = [
-                f"{effect_label(each.name)}, {values_with_intervals(each.parameters)}" for each in built
-            ]
-            sentences.append(f"Built in is what fits best, {enumerated(values)}.")
-    if diagnosis.varying:
-        sentences += [varying_text(effect) for effect in diagnosis.varying]
-    if diagnosis.unexplained:
-        channels = enumerated(
-            [*dict.fromkeys(CHANNEL_WORDS[left.channel][0] for left in diagnosis.unexplained)]
-        )
-        also = " also" if sentences else ""
-        sentences.append(f"The residual is{also} systematic, without a known cause, in {channels}.")
-    return " ".join(sentences) or f"These runs show nothing that the simulation of {diagnosis.robot} lacks."
-
-
 def gain_text(gain: Gain) -> str:
     """Return what an extension gains on data held out, beside the black-box learner.
 
@@ -219,28 +189,6 @@ def gain_text(gain: Gain) -> str:
     part = f"{percent_text(gain.reduction)} ({percent_text(gain.ci[0], '')} to {percent_text(gain.ci[1])})"
     refused = ", which may be nothing" if gain.refused else ""
     return f"Judged on {gain.how}, the extension removes {part} of the square{refused}, {learner}."
-
-
-def learned_texts(gains: Sequence[LearnedGain]) -> list[str]:
-    """Return a sentence on each learned term that is built in.
-
-    Examples
-    --------
-    >>> gain = LearnedGain("speed_x_mps", "speed lost in turns", 0.1, 0.81, (0.74, 0.88), 0.83, True)
-    >>> (text,) = learned_texts([gain, gain._replace(is_kept=False)])
-    >>> text.replace(NBSP, " ")
-    'No name fits "speed lost in turns": a learned term of it removes 81 % of the square of speed ahead, names 10 %.'
-    """
-    texts = []
-    for gain in gains:
-        if gain.is_kept:
-            both, named = percent_text(gain.reduction), percent_text(gain.named_reduction)
-            of = CHANNEL_WORDS[gain.channel][0]
-            texts.append(
-                f'No name fits "{gain.says}": a learned term of it removes {both} of the square of {of}, '
-                f"names {named}."
-            )
-    return texts
 
 
 def sources_of(diagnosis: Diagnosis, data: str) -> dict[str, str]:

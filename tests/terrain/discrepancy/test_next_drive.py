@@ -78,7 +78,7 @@ def test_an_effect_that_was_not_excited_gets_a_drive_with_its_limit():
     missed = [Limit("side_hill_slip_ratio", np.inf, "ratio", "both signs of roll")]
     suggested = next_drive(AGRIMARO, (), missed, evidence_of(AGRIMARO, drives(AGRIMARO, "straight"), names))
     assert suggested.grade_deg > 0  # there is no roll on the level
-    limit = float(re.search(r"from infinite to ([\d.]+) ratio", suggested.reason)[1])
+    limit = float(re.search(r"side hill slip from ([\d.]+) up", suggested.reason)[1])
     driven = drives(AGRIMARO, suggested, seeds=[0])
     a, _ = evidence_of(AGRIMARO, driven, names).total(names[:1])
     assert 5.48 / np.sqrt(a[0, 0]) == pytest.approx(limit, rel=0.6)
