@@ -1,4 +1,4 @@
-"""Robots that nobody has tuned to: what the first halves of measured drives state holds on the second ones."""
+"""Robots of other groups, tuned to by none of this: the first halves of their drives hold on the second ones."""
 
 import importlib
 import sys
