@@ -38,6 +38,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -101,6 +102,7 @@ class Factor(NamedTuple):
     number: float = 0.0  #: where ``max`` begins, or the lag of ``change`` in s
 
 
+@cache
 def factors_of(product: str) -> tuple[Factor, ...]:
     """Return the factors of a product.
 

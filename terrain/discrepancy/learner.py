@@ -136,6 +136,7 @@ class Learned(NamedTuple):
     )
     reference_gain: float  #: that the black-box reference removes there; NaN where there are too few runs
     left_std: float  #: beside the noise, of what is left there, in the channel's unit
+    noise_std: float  #: root mean square of the noise of these runs
 
 
 def learn_terms(
@@ -164,15 +165,17 @@ def learn_terms(
     steps_inputs = [term_inputs(run, simulation, low_pass) for run in runs]
     every = np.concatenate([inputs for _, inputs in steps_inputs])
     ranges = driven_ranges([inputs for _, inputs in steps_inputs])
+    references = _reference_errors(compared, groups)
+    known: dict[tuple[str, ...], list[Array]] = {}  # of the last dictionary: those of motion are one
     for channel in ORDER:
         # without a heading of its own the gyro shows the motion
         shown = GYRO if channel == HEADING and HEADING not in measured else channel
         if shown not in measured or (channel == GYRO and HEADING not in measured):
             continue
-        products = dictionary(every, channel)
-        grams = []
-        for run, (dt, inputs) in zip(runs, steps_inputs, strict=True):
-            columns = columns_of(products, inputs, np.full(len(inputs), dt))
+        products, grams = dictionary(every, channel), []
+        if products not in known:
+            known = {products: [columns_of(products, x, np.full(len(x), dt)) for dt, x in steps_inputs]}
+        for run, columns in zip(runs, known[products], strict=True):
             rows = rows_of(run, simulation.planar_on(run.terrain), simulation.vector, (), low_pass)
             left = rows.residual[:, [CHANNELS.index(shown)]]
             table = np.hstack([term_rows(run, simulation, low_pass, shown, channel, columns), left])
@@ -183,13 +186,15 @@ def learn_terms(
         n_rows = sum([n for _, n in grams])
         c = CHANNELS.index(shown)
         before = sum(float(np.nansum(run.residual(False)[:, c] ** 2)) for run in compared)
-        if not n_rows or not before > 0.0:
+        sums = sums[sums[:, -1, -1] > 0.0]
+        if len(sums) < MIN_GROUPS or not before > 0.0:
             continue
         errors = cross_validated(sums)
-        reference = _reference_error(compared, groups, c)
+        reference = float(references[c])
         n = size_of(errors, (1.0 - ENOUGH) * before + ENOUGH * reference)
-        of_noise = np.concatenate([noise.size(run.pace_mps)[:, c] for run in compared]) ** 2
-        left_std = math.sqrt(max(float(errors[:, n].sum()) / n_rows - float(np.nanmean(of_noise)), 0.0))
+        sizes = np.concatenate([noise.size(run.pace_mps)[:, c] for run in compared])
+        noise_std = float(np.sqrt(np.nanmean(sizes**2)))
+        left_std = math.sqrt(max(float(errors[:, n].sum()) / n_rows - noise_std**2, 0.0))
         term = None
         if n:
             total = sums.sum(axis=0)
@@ -203,7 +208,7 @@ def learn_terms(
             term = LearnedTerm(channel, names, coefficients, covariance, used, left_std, says)
             simulation = simulation.with_learned([term])
         inner_gain, reference_gain = (1.0 - np.array([errors[:, n].sum(), reference]) / before).tolist()
-        learned[shown] = Learned(term, inner_gain, reference_gain, left_std)
+        learned[shown] = Learned(term, inner_gain, reference_gain, left_std, noise_std)
     return learned
 
 
@@ -229,10 +234,14 @@ def replay_std(
     about = simulation.planar_on(run.terrain), simulation.vector, covariance.parameters, low_pass
     rows = rows_of(run, *about)
     change = rows.sensitivity
-    variance = noise.size(rows.pace_mps) ** 2 + np.einsum("pmc,pq,qmc->mc", change, covariance.matrix, change)
+    size = noise.size(rows.pace_mps)
+    variance = size**2 + np.einsum("pmc,pq,qmc->mc", change, covariance.matrix, change)
     dt, inputs = term_inputs(run, simulation, low_pass)
     for shown, each in learned.items():
-        variance[:, CHANNELS.index(shown)] += each.left_std**2
+        c = CHANNELS.index(shown)
+        variance[:, c] += (
+            each.left_std / each.noise_std * size[:, c]
+        ) ** 2  # it grows with speed as the noise
         if each.term is None:
             continue
         columns = each.term.columns(inputs, np.full(len(inputs), dt))
@@ -445,20 +454,12 @@ def size_of(errors: Array, enough: float) -> int:
     return n if more[0] > student.ppf(LEVEL, freedom) * error[0] else 0
 
 
-def _reference_error(compared: Sequence[ComparedRun], groups: Array, c: int) -> float:
-    """Return the squared error of the black-box reference of a channel, in folds of whole groups."""
-    from sklearn.linear_model import BayesianRidge
-
-    fold = np.repeat(groups % REFERENCE_FOLDS, [len(run.time_s) for run in compared])
-    x, y = (
-        np.concatenate([_regressors(run) for run in compared]),
-        np.concatenate([run.residual(False)[:, c] for run in compared]),
-    )
-    known, total = np.isfinite(y) & np.isfinite(x).all(axis=1), 0.0
-    spread = x[known].std(axis=0)
-    x = (x - x[known].mean(axis=0))[:, spread > LEAST_RANGE] / spread[spread > LEAST_RANGE]
-    for k in np.unique(fold[known]):
-        train, test = known & (fold != k), known & (fold == k)
-        predicted = BayesianRidge().fit(x[train], y[train]).predict(x[test])
-        total += float(((y[test] - predicted) ** 2).sum())
-    return total
+def _reference_errors(compared: Sequence[ComparedRun], groups: Array) -> Array:
+    """Return the squared error (channels,) of the black-box reference, in folds of whole groups."""
+    fold, errors = groups % REFERENCE_FOLDS, np.zeros(len(CHANNELS))
+    for k in np.unique(fold):
+        inside = [run for run, own in zip(compared, fold, strict=True) if own == k]
+        others = [run for run, own in zip(compared, fold, strict=True) if own != k]
+        for run, predicted in zip(inside, predicted_residuals(others, inside), strict=True):
+            errors += np.nansum((run.residual(False) - np.nan_to_num(predicted)) ** 2, axis=0)
+    return errors

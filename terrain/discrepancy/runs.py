@@ -54,6 +54,8 @@ from terrain.simulation.plants.planar import (
     Ground,
     Planar,
     corrected_inputs,
+    delayed,
+    lateness,
     make_planar,
     move,
     planar_ground,
@@ -658,10 +660,11 @@ def term_rows(
     dt, wheel_speed, steer, _, _, measured = prepare_inputs(signals, low_pass)
     truth: Any = np.zeros(len(columns), TRUTH)
     at_rest = sense(planar.body, vector, dt, truth)[:, c]
-    field_name, seen = FIELDS.get(acts_on, acts_on), np.empty_like(columns)
+    truth[FIELDS.get(acts_on, acts_on)] = 1.0
+    gain = sense(planar.body, vector, dt, truth)[:, c] - at_rest  # what is even is not delayed
+    late, seen = lateness(planar.body, vector, dt)[c], np.empty_like(columns)
     for j, column in enumerate(columns.T):
-        truth[field_name] = column
-        seen[:, j] = sense(planar.body, vector, dt, truth)[:, c] - at_rest
+        seen[:, j] = gain * delayed(np.ascontiguousarray(column), *late)
     known = np.isfinite(measured[:, [c]])
     holes = known[:, :0] if known.all() else np.repeat(known, columns.shape[1], axis=1)
     rows = decimate(seen, holes, low_pass.taps, low_pass.every)

@@ -1224,14 +1224,26 @@ def sense(params: Array, vector: Array, dt: float, truth: Array) -> Array:
         out[k, 4] = row.current_a * warm + body.n_wheels * p.current_offset_a
         out[k, 5] = row.turning_current_a * warm
         out[k, 6] = w
-    offset, rate = p.clock_offset_s / dt, p.clock_rate_ratio
+    late = lateness(params, vector, dt)
+    for c in range(7):
+        if late[c, 0] != 0.0 or late[c, 1] != 0.0:
+            out[:, c] = delayed(out[:, c].copy(), late[c, 0], late[c, 1])
+    return out
+
+
+@njit
+def lateness(params: Array, vector: Array, dt: float) -> Array:
+    """Return by channel (len(CHANNELS), 2) how many samples late it is at the start, and what a sample adds.
+
+    Currents are logged with the wheels; parameters are those of :func:`sense`.
+    """
+    body, p, late = params[0], vector.view(EFFECTS)[0], np.zeros((7, 2))
     camera = (body.latency_s + p.camera_latency_s) / dt
     imu = (body.imu_latency_s + p.imu_latency_s + body.imu_lag_s) / dt
     for c in (0, 1, 2, 3, 6):
-        late = offset + (imu if c in (0, 3) else camera)
-        if late != 0.0 or rate != 0.0:
-            out[:, c] = delayed(out[:, c].copy(), late, rate)
-    return out
+        late[c, 0] = p.clock_offset_s / dt + (imu if c in (0, 3) else camera)
+        late[c, 1] = p.clock_rate_ratio
+    return late
 
 
 @cache
