@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from studies.foreign.physics import G_MPS2, SAMPLE_S, STEP_S, Body, Motion, slopes_of
+from studies.foreign.sensors import Motor
 from terrain.records import Array
 
 SCENE_STEP_S = STEP_S / 2
@@ -57,7 +58,7 @@ def _quat(yaw_rad: float) -> str:
     return f"{math.cos(yaw_rad / 2)} 0 0 {math.sin(yaw_rad / 2)}"
 
 
-def _wheel(k: int, body: Body, scene: Scene, kind: str, motor_inertia: float) -> str:
+def _wheel(k: int, body: Body, scene: Scene, kind: str, inertia: float, friction_nm: float) -> str:
     """Return a wheel on the shaft of its motor, with play between them where there is some."""
     x, y = body.wheels_m[k]
     radius = body.radius_m[k]
@@ -66,7 +67,7 @@ def _wheel(k: int, body: Body, scene: Scene, kind: str, motor_inertia: float) ->
     touch = f'<geom name="tyre{k}" type="ellipsoid" size="{size}" mass="{WHEEL_KG}"/>'
     play = f'<joint name="play{k}" axis="0 1 0" range="{-scene.play_rad} {scene.play_rad}" limited="true"/>'
     shaft = (
-        f'<joint name="motor{k}" axis="0 1 0" armature="{motor_inertia}" frictionloss="{scene.bearing_nm}"/>'
+        f'<joint name="motor{k}" axis="0 1 0" armature="{inertia}" frictionloss="{friction_nm}"/>'
         '<inertial pos="0 0 0" mass="0.1" diaginertia="1e-3 1e-3 1e-3"/>'
         f"<body>{play if scene.play_rad else ''}{touch}</body>"
     )
@@ -95,13 +96,14 @@ def _ball(k: int, body: Body, scene: Scene, inertia: float) -> str:
     )
 
 
-def model_of(kind: str, body: Body, scene: Scene, motor_inertia: float) -> Any:
+def model_of(kind: str, body: Body, scene: Scene, motor: Motor) -> Any:
     """Return the model of a scene."""
     import mujoco
 
     wheels, w = range(len(body.wheels_m)), float(body.radius_m.mean())
     x, y = body.com_m
-    motor_inertia = max(motor_inertia, LEAST_INERTIA_KGM2[kind])
+    motor_inertia = max(motor.inertia_kgm2, LEAST_INERTIA_KGM2[kind])
+    friction_nm = motor.friction_nm + scene.bearing_nm
     mounted = "".join(
         f'<site name="mount{k}" pos="{body.wheels_m[k][0]} {body.wheels_m[k][1]} 0" '
         f'quat="{_quat(math.atan2(*body.wheels_m[k][::-1]) + math.pi / 2)}"/>'
@@ -111,7 +113,7 @@ def model_of(kind: str, body: Body, scene: Scene, motor_inertia: float) -> Any:
     parts = "".join(
         _ball(k, body, scene, motor_inertia)
         if kind == "omni"
-        else _wheel(k, body, scene, kind, motor_inertia)
+        else _wheel(k, body, scene, kind, motor_inertia, friction_nm)
         for k in wheels
     )
     own = body.mass_kg - len(wheels) * (BALL_KG if kind == "omni" else WHEEL_KG)
@@ -134,10 +136,10 @@ def model_of(kind: str, body: Body, scene: Scene, motor_inertia: float) -> Any:
     sensed = "".join(f'<{what} actuator="a{k}"/>' for what in MOTORS for k in range(len(servos))) + angles
     if kind == "car":
         servos += [f'<position joint="steer{k}" kp="400"/>' for k in (0, 1)]
-    mu = body.friction_ratio
+    mu, drag_m = body.friction_ratio, body.drag_ratio * w
     pairs = "".join(
-        f'<pair geom1="ground" geom2="tyre{k}" condim="3" friction="{mu} {mu} 0 0 0" solref="{NORMAL_S} 1" '
-        f'solreffriction="{CREEP_S} 1"/>'
+        f'<pair geom1="ground" geom2="tyre{k}" condim="6" friction="{mu} {mu} 0.001 {drag_m} {drag_m}" '
+        f'solref="{NORMAL_S} 1" solreffriction="{CREEP_S} 1"/>'
         for k in wheels
     )
     xml = f"""
@@ -155,7 +157,7 @@ def model_of(kind: str, body: Body, scene: Scene, motor_inertia: float) -> Any:
     return mujoco.MjModel.from_xml_string(xml)
 
 
-def moved(kind: str, body: Body, scene: Scene, motor_inertia: float, driven: Any) -> Recorded:
+def moved(kind: str, body: Body, scene: Scene, motor: Motor, driven: Any) -> Recorded:
     """Return what a scene records where its motors are asked for the rates and angles of :class:`worlds.Driven`."""
     import mujoco
     from mujoco import rollout
@@ -169,7 +171,7 @@ def moved(kind: str, body: Body, scene: Scene, motor_inertia: float, driven: Any
     models, starts = [], []
     for i in range(runs):
         own = body._replace(friction_ratio=body.friction_ratio * driven.friction[i])
-        model = model_of(kind, own, scene, motor_inertia)
+        model = model_of(kind, own, scene, motor)
         s_x, s_y = driven.slope[i]
         model.opt.gravity[:] = -G_MPS2 * np.array([s_x, s_y, 1.0]) / math.sqrt(1.0 + s_x**2 + s_y**2)
         data = mujoco.MjData(model)
@@ -206,5 +208,8 @@ def moved(kind: str, body: Body, scene: Scene, motor_inertia: float, driven: Any
         seen_y_mps=mean[..., 7],
         seen_m=mean[..., 15:17],
     )
-    rest = mean[..., 18 + motors :]
-    return Recorded(motion, turned, rest[..., :motors], rest[..., motors:])
+    turning, rest = mean[..., 18 : 18 + motors], mean[..., 18 + motors :]
+    torque = rest[..., :motors]
+    if kind == "omni":  # friction of a ball's joint would act about all of its axes
+        torque = torque + motor.friction_nm * np.tanh(turning / 0.15)
+    return Recorded(motion, turned, torque, rest[..., motors:])

@@ -201,7 +201,7 @@ def test_a_scene_drives_as_its_wheels_turn(kind):
     world = WORLDS["mujoco", kind]()
     driven = driven_by(world, 1, np.random.default_rng(0), 2.5)
     level = driven._replace(slope=np.zeros((1, 2)))
-    recorded = scenes.moved(kind, world.body, Scene(), world.motor.inertia_kgm2, level)
+    recorded = scenes.moved(kind, world.body, Scene(), world.motor, level)
     rate = np.gradient(recorded.turned_rad[:, 0], SAMPLE_S, axis=0) * world.body.radius_m[0]
     turns = np.full((1, rate.shape[1]), 1.0 / rate.shape[1])
     if kind == "omni":
@@ -211,5 +211,7 @@ def test_a_scene_drives_as_its_wheels_turn(kind):
     motion = recorded.motion
     np.testing.assert_allclose(motion.speed_x_mps[:, 0], (rate @ turns.T)[:, 0], atol=0.12)
     assert np.abs(motion.speed_x_mps).max() > 0.1
-    heavier = scenes.moved(kind, world.body._replace(mass_kg=2 * world.body.mass_kg), Scene(), 0.01, level)
+    heavier = scenes.moved(
+        kind, world.body._replace(mass_kg=2 * world.body.mass_kg), Scene(), world.motor, level
+    )
     assert not np.array_equal(heavier.motion.speed_x_mps, motion.speed_x_mps)

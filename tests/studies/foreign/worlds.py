@@ -314,9 +314,7 @@ def runs_of(world: World, driven: Driven, seed: np.random.SeedSequence) -> tuple
         recorded = _plain_records(world, driven)
     else:
         mounts = {"lidar_m": world.sensing.lidar_m, "lidar_yaw_rad": world.sensing.lidar_yaw_rad}
-        recorded = scenes.moved(
-            world.name, world.body, world.scene._replace(**mounts), world.motor.inertia_kgm2, driven
-        )
+        recorded = scenes.moved(world.name, world.body, world.scene._replace(**mounts), world.motor, driven)
     motion, rngs = recorded.motion, [np.random.default_rng(child) for child in seed.spawn(4)]
     kinds = (
         {"pose": sensors.pose_of}
@@ -445,7 +443,7 @@ def _effects() -> Iterator[ForeignEffect]:
     heavier = ("motor_constant", "roller_friction", "scrub")
     yield each("payload", ("skid", "swerve", "omni"), change, 1.0, False, ("payload",), heavier)
     change = body(drag_ratio=lambda b, e: b.drag_ratio + e)
-    yield each("soft_ground", _MOTORS, change, 0.2, False, ("rolling_resistance",), (), _PLAIN)
+    yield each("soft_ground", _MOTORS, change, 0.2, False, ("rolling_resistance",))
     change = body(roller_ratio=lambda b, e: b.roller_ratio + e)
     yield each("sticky_rollers", ("omni",), change, 0.2, False, ("roller_friction",), (), _PLAIN)
     change = motor(weak_ratio=lambda m, e: e)
