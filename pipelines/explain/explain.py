@@ -191,7 +191,7 @@ def explain(
         before, after = diagnosed.simulation.effects, diagnosed.extended.effects
         compared = classifier_gain(diagnosed.held_out, robot, before, after, seed, progress=progress)
         gained = replace(gained, comparisons={**gained.comparisons, "classifier": compared})
-    if diagnosed.with_terms is not diagnosed.simulation:
+    if diagnosed.with_terms is not diagnosed.simulation or diagnosis.latest:
         values, cov, _ = extended_effects(robot, diagnosis)
         source = f"terrain explain, {diagnosis.n_runs} runs of {data or 'a data set'}"
         terms = [replace(term, source=source) for term in diagnosed.with_terms.learned[len(robot.learned) :]]

@@ -93,7 +93,8 @@ class ExplainResult(Result, eq=False):
     @property
     def is_extended(self) -> bool:
         """Whether anything that was named or learned is built in."""
-        return bool(self.diagnosis.built_in) or self.extended.learned != self.robot.learned
+        built_in = self.diagnosis.built_in or self.diagnosis.latest
+        return bool(built_in) or self.extended.learned != self.robot.learned
 
     def as_json(self) -> dict[str, Any]:
         """Return the described fields, those of the diagnosis, and what the runs were used for."""

@@ -221,7 +221,7 @@ def varying_text(effect: Varying) -> str:
     Examples
     --------
     >>> about = "wheel_radius", "wheel_radius_ratio", "ratio", (), -0.035, 0.022, 10.2, (), "speed_x_mps"
-    >>> varying_text(Varying(*about, Kind.TREND, -0.07, (-0.072, -0.068), 20)).replace("\xa0", " ")
+    >>> varying_text(Varying(*about, Kind.TREND, -0.07, (-0.072, -0.068), None, 20)).replace("\xa0", " ")
     'The wheel radius falls by 7 % (6.8 to 7.2 %) over these 20 runs.'
     """
     mean, scatter = (quantity(effect.parameter, value) for value in (effect.mean, effect.scatter))
@@ -246,6 +246,11 @@ def varying_text(effect: Varying) -> str:
     else:
         text = (
             f"The {name} differs from run to run: {mean} on average, with a standard deviation of {scatter}."
+        )
+    if effect.latest is not None:
+        text += (
+            f" The extended robot has its value after the last run, {values_with_intervals([effect.latest])}, for "
+            "which no gain is claimed."
         )
     if effect.rivals:
         rivals = enumerated([effect_label(rival) for rival in effect.rivals], "or")

@@ -23,6 +23,7 @@ from terrain.discrepancy.evidence import (
     TRUST_DOF,
     Evidence,
     clustered_variance,
+    evidence_at,
     marginal,
     marginal_parts,
     z_of_t,
@@ -399,7 +400,7 @@ def varying_effects(problem: Problem, fit: CauseFit) -> tuple[verdict.Varying, .
     name, mean = best.effect.name, float(np.average(of.value, weights=of.weight))
     channel = CHANNELS[int(np.argmax(info.channel_power(np.eye(len(info.names))[info.places([of.name])])))]
     about = of.name.rpartition("_")[2], rivals, mean, of.scatter, of.evidence
-    return (verdict.Varying(name, of.name, *about, *_in_words(of, problem.signals, channel)),)
+    return (verdict.Varying(name, of.name, *about, *_in_words(of, problem.signals, channel, rivals)),)
 
 
 def rogue_run(varying: Sequence[verdict.Varying]) -> Excluded | None:
@@ -414,13 +415,28 @@ def rogue_run(varying: Sequence[verdict.Varying]) -> Excluded | None:
     return None
 
 
-def unlike_in(problem: Problem, fit: CauseFit, run: Signals) -> Excluded | None:
-    """Return what a run beside those of a fit is unlike them in; None where that is no one value."""
-    both = problem._replace(signals=(*problem.signals, run))
-    info = both.at(fit.info.origin, noise=fit.info.noise, scatter=fit.info.scatter)
-    info = info.counted_from(fit.info.vector)
-    found = rogue_run(varying_effects(both, cause_fit(both, info, fit.causes)))
-    return found if found is not None and found.run_id == run.run_id else None
+def rogues_among(problem: Problem, fit: CauseFit, runs: Sequence[Signals]) -> tuple[Excluded, ...]:
+    """Return runs beside those of a fit that are unlike them in one value each, with what that is."""
+    left, rogues = list(runs), []
+    info = fit.info
+    while left:
+        both = problem._replace(signals=(*problem.signals, *left))
+        at = evidence_at(
+            left, problem.simulation, info.origin, info.names, problem.low_pass, info.noise, info.scatter
+        )
+        at = at.counted_from(info.vector)
+        joint = replace(
+            info,
+            grams=np.concatenate([info.grams, at.grams]),
+            rows=(*info.rows, *at.rows),
+            white=(*info.white, *at.white),
+        )
+        found = rogue_run(varying_effects(both, cause_fit(both, joint, fit.causes)))
+        if found is None or found.run_id not in [run.run_id for run in left]:
+            break
+        rogues.append(found)
+        left = [run for run in left if run.run_id != found.run_id]
+    return tuple(rogues)
 
 
 def _own_values(
@@ -515,14 +531,29 @@ def values_by_run(
     return RunValues(name, value + mean, precision, beyond_noise, z, variance)
 
 
-def _in_words(of: RunValues, signals: Sequence[Signals], channel: str) -> tuple[Any, ...]:
+def _in_words(
+    of: RunValues, signals: Sequence[Signals], channel: str, rivals: Sequence[str]
+) -> tuple[Any, ...]:
     """Return the last fields of a :class:`verdict.Varying`: groups, channel, pattern and what it changes by."""
     found = of.pattern
     if found is None or not found.z > (Z_NEAR if of.z > Z_VARIES else Z_VARIES):
         return (), channel
+
+    def latest(combination: Array) -> verdict.Value | None:
+        seen = np.isfinite(of.variance)
+        left = (of.value - found.values)[seen]
+        value, ends = found.at(combination)
+        half = math.hypot(0.5 * (ends[1] - ends[0]), verdict.INTERVAL_T * float(np.sqrt(np.mean(left**2))))
+        return (
+            None
+            if rivals
+            else verdict.Value(of.name, value, of.name.rpartition("_")[2], value - half, value + half)
+        )
+
     if found.kind is Kind.TREND:
         span = float(np.ptp(found.columns[:, 1]))
-        return (), channel, found.kind, *found.at(np.array([0.0, span])), round(span) + 1
+        at_last = latest(np.array([1.0, float(found.columns[:, 1].max())]))
+        return (), channel, found.kind, *found.at(np.array([0.0, span])), at_last, round(span) + 1
     # of two groups the smaller value first, of a change what was before, of a rogue the others
     order, groups = range(len(found.coefficients)), []
     if found.kind in (Kind.GROUPS, Kind.SESSIONS, Kind.TERRAINS):
@@ -534,7 +565,8 @@ def _in_words(of: RunValues, signals: Sequence[Signals], channel: str) -> tuple[
         groups.append(verdict.RunGroup(float(found.coefficients[k]), std, runs))
     apart = np.zeros(len(found.coefficients))
     apart[order[-1]], apart[order[0]] = 1.0, -1.0
-    return tuple(groups), channel, found.kind, *found.at(apart)
+    last = latest(np.array([0.0, 1.0])) if found.kind is Kind.CHANGE else None
+    return tuple(groups), channel, found.kind, *found.at(apart), last
 
 
 # -- Linear mixed model of runs: parameters that all runs share, and such of which each run has its own value --

@@ -226,9 +226,9 @@ def find_causes(
     fit = _withdraw_varying(problem, fit, varies, withdrawn)
     fit = pooled(problem, fit._replace(rivals=rivals_of(problem, fit.info, start, fit.causes)))
     by_id = {run.run_id: run for run in repaired(signals, faults)}
-    unlike = [run.run_id for run in excluded if run.reason.startswith(UNLIKE)][:MAX_UNLIKE]
-    named_in = {run_id: constancy.unlike_in(problem, fit, by_id[run_id]) for run_id in unlike}
-    excluded = tuple([named_in.get(run.run_id) or run for run in excluded])
+    unlike = [by_id[run.run_id] for run in excluded if run.reason.startswith(UNLIKE)][:MAX_UNLIKE]
+    named_in = {run.run_id: constancy.rogues_among(problem, fit, [run]) for run in unlike}
+    excluded = tuple([(*named_in.get(run.run_id, ()), run)[0] for run in excluded])
     return Found(problem, start, fit, withdrawn, varying, excluded, faults, clocks_of(aligned, shift))
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from terrain.discrepancy.compared import ComparedRun, beside_extended, compare_runs, without_levels
-from terrain.discrepancy.constancy import PartValues, part_values
+from terrain.discrepancy.constancy import PartValues, part_values, rogues_among
 from terrain.discrepancy.diagnose import check_ids, find_causes, judged, statement_of
 from terrain.discrepancy.earned import MIN_RUNS, crossed_runs, held_out_runs
 from terrain.discrepancy.gain import Gain
@@ -108,6 +108,9 @@ def diagnose_runs(
     if held_out:
         given = [by_id[run.run_id] for run in held_out]
         held = repair_held_out(given, found.faults, found.extended, problem.low_pass, found.noise)
+        rogues = rogues_among(problem, found.fit, held)
+        found = found._replace(excluded=(*found.excluded, *rogues))
+        held = tuple([run for run in held if run.run_id not in [rogue.run_id for rogue in rogues]])
         plain = compare_runs(simulation, None, problem.signals, problem.low_pass)
         with suppress(DataError):  # none of them is fit to judge on
             on = held_out_runs(plain, held, found.extended, *about)
@@ -199,7 +202,7 @@ def gain_built_in(diagnosed: DiagnosedRuns, seed: int) -> Gain | None:
 def extended_effects(
     robot: Robot, diagnosis: Diagnosis
 ) -> tuple[dict[str, float], Array, dict[str, tuple[float, float]]]:
-    """Return the effects of the robot with the named causes added.
+    """Return the effects of the robot with the named causes added, and the last value of what follows the runs' order.
 
     The covariance of a parameter that was found again is that of the new estimate; all other parameters keep
     theirs, and the two groups are taken as independent.
@@ -228,6 +231,14 @@ def extended_effects(
         )
     added = diagnosis.values
     values = {name: robot.effects.get(name, 0.0) + added.get(name, 0.0) for name in names}
+    for latest in diagnosis.latest:  # in the place of a mean of all runs
+        if latest.name not in names:
+            names.append(latest.name)
+            cov = np.pad(cov, (0, 1))
+        k = names.index(latest.name)
+        values[latest.name] = robot.effects.get(latest.name, 0.0) + latest.value
+        cov[k], cov[:, k] = 0.0, 0.0
+        cov[k, k] = (0.5 * (latest.high - latest.low) / INTERVAL_T) ** 2
     halves = dict(zip(names, (INTERVAL_T * np.sqrt(cov.diagonal())).tolist(), strict=True))
     return values, cov, {name: (values[name] - halves[name], values[name] + halves[name]) for name in names}
 

@@ -107,6 +107,9 @@ class Varying(NamedTuple):
     """From the first run to the last along a trend, else from the first of the groups to the last; NaN without a
     pattern."""
     change_ci: tuple[float, float] = (math.nan, math.nan)  #: its 95 % interval
+    latest: Value | None = None
+    """After the last run, with the scatter of runs about the pattern: what the extension has of a trend or a change
+    that no rival explains; None for all else, of which it has the mean, if that is a cause."""
     n_runs: int = 0  #: from the first of the order to the last, those between that were not compared counted
 
 
@@ -240,6 +243,11 @@ class Diagnosis:
     def values(self) -> dict[str, float]:
         """The parameters of all effects that extend the simulation."""
         return {value.name: value.value for cause in self.built_in for value in cause.parameters}
+
+    @property
+    def latest(self) -> tuple[Value, ...]:
+        """The values after the last run of what follows the order of the runs, which the extension has."""
+        return tuple([effect.latest for effect in self.varying if effect.latest is not None])
 
     @property
     def differing_channels(self) -> tuple[str, ...]:

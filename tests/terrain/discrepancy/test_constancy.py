@@ -248,6 +248,9 @@ def test_a_tyre_that_loses_air_is_a_trend_in_its_size_and_one_rogue_run_is_named
     low, high = effect.change_ci
     assert effect.change == pytest.approx(-0.07, rel=0.2)
     assert low < -0.07 < high < -0.05
+    # the extended robot has what the tyre is after the last run
+    assert effect.latest.value == pytest.approx(-0.07, rel=0.2)
+    assert effect.latest.low < -0.07 < effect.latest.high
     rogue = diagnose(with_rogue := runs(0.08 * (np.arange(N_RUNS) == 3)), SIMULATION, library)
     (out,) = rogue.excluded_runs
     assert (rogue.varying, out.run_id) == ((), with_rogue[3].run_id)
