@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, beside_extended, compare_runs
-from terrain.discrepancy.evidence import evidence_at
+from terrain.discrepancy.evidence import MIN_CLUSTERS, evidence_at
 from terrain.discrepancy.gain import (
     ChannelGain,
     Gain,
@@ -94,6 +94,11 @@ class HeldOut(NamedTuple):
     noise: Mapping[str, float]
     seed: int
     excluded: tuple[Excluded, ...] = ()
+
+    @property
+    def shown(self) -> bool:
+        """Whether runs are left out in turn that are enough for an interval of the evidence itself."""
+        return self.in_turn and len(self.plain) >= MIN_CLUSTERS
 
     @property
     def in_turn(self) -> bool:
@@ -216,11 +221,11 @@ class Judgement(NamedTuple):
     """Part of the square before the extension that each removes beside the others, in the channels where it acts."""
     acting: Mapping[str, tuple[str, ...]]  #: channels beside which each is stated, the largest change first
     reasons: Mapping[str, str]  #: why some do not earn their names; empty where all do
-    in_turn: bool  #: whether the runs are those behind the diagnosis, left out in turn
+    shown: bool  #: whether runs were left out in turn that are enough for an interval of the evidence itself
 
     def earned(self, gain: Gain | ChannelGain) -> bool:
         """Return whether a gain, of a channel or of all, is as good as :func:`terrain.discrepancy.gain.earns` asks."""
-        return earns(gain.reduction, gain.ci, gain.learner_reduction, self.in_turn)
+        return earns(gain.reduction, gain.ci, gain.learner_reduction, self.shown)
 
 
 def judge(fit: CauseFit, built: Sequence[Effect], on: HeldOut) -> Judgement:
@@ -250,9 +255,9 @@ def judge(fit: CauseFit, built: Sequence[Effect], on: HeldOut) -> Judgement:
         ratio, interval = removed[cause.name] = part.gain(weights * acts, on.seed)
         own_gain, learner, _ = gains_of(squares @ (weights * acts), True, on.seed)
         words = " and ".join([CHANNEL_WORDS[name][0] for name in main])
-        if not earns(ratio, interval, -math.inf, on.in_turn):
+        if not earns(ratio, interval, -math.inf, on.shown):
             reasons[cause.name] = f"{_percent(ratio, interval)} of the square of {words} go with it"
-        elif not earns(*own_gain, learner[0], on.in_turn):
+        elif not earns(*own_gain, learner[0], on.shown):
             beside = f"a black-box learner removes {100 * learner[0]:.0f} %"
             reasons[cause.name] = f"{_percent(*own_gain)} of the square of {words} go, {beside}"
         for name in gain.channels:
@@ -261,7 +266,7 @@ def judge(fit: CauseFit, built: Sequence[Effect], on: HeldOut) -> Judgement:
                 worse = f"{CHANNEL_WORDS[name][0]} worse, by {-100 * more:.0f} % of its square"
                 reasons.setdefault(cause.name, f"it makes {worse}")
     reasons = {name: f"on {on.how}: {why}" for name, why in reasons.items()}
-    return Judgement(gain, runs, removed, acting, reasons, on.in_turn)
+    return Judgement(gain, runs, removed, acting, reasons, on.shown)
 
 
 def _percent(ratio: float, interval: Interval) -> str:

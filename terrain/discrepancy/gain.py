@@ -56,13 +56,13 @@ def ratio_of_sums(part: Array, whole: Array, seed: int) -> tuple[float, Interval
     return float(part.sum() / whole.sum()), percentile_interval(ratios, freedom=n - 1)
 
 
-def earns(reduction: float, ci: Interval, learner_reduction: float, in_turn: bool) -> bool:
+def earns(reduction: float, ci: Interval, learner_reduction: float, shown: bool) -> bool:
     """Return whether a gain is at least half of the learner's, and above 0 with its interval.
 
-    Where runs were left out ``in_turn`` the interval may hold 0: that a cause helps runs left out, with what varies
-    from run to run taken out, is in its evidence already (:attr:`terrain.discrepancy.evidence.WaldTest.gain_interval`).
+    The interval may hold 0 where it is ``shown`` already that it helps runs left out in turn: with what varies from run
+    to run taken out, in the evidence of its causes (:attr:`terrain.discrepancy.evidence.WaldTest.gain_interval`).
     """
-    return (reduction if in_turn else ci[0]) > 0.0 and not reduction < HALF * learner_reduction
+    return (reduction if shown else ci[0]) > 0.0 and not reduction < HALF * learner_reduction
 
 
 class ChannelGain(NamedTuple):

@@ -120,7 +120,7 @@ def test_sessions_are_held_out_and_a_run_that_cannot_be_compared_is_excluded_wit
 
 
 @pytest.mark.parametrize(
-    ("reduction", "low", "learner", "in_turn", "expected"),
+    ("reduction", "low", "learner", "shown", "expected"),
     [
         (0.5, 0.1, 0.9, False, True),
         (0.4, 0.1, 0.9, False, False),  # under half of what the learner removes
@@ -130,5 +130,5 @@ def test_sessions_are_held_out_and_a_run_that_cannot_be_compared_is_excluded_wit
         (0.2, 0.1, -0.9, False, True),
     ],
 )
-def test_a_gain_is_earned_above_0_and_by_half_of_the_learners(reduction, low, learner, in_turn, expected):
-    assert earns(reduction, (low, 1.0), learner, in_turn) is expected
+def test_a_gain_is_earned_above_0_and_by_half_of_the_learners(reduction, low, learner, shown, expected):
+    assert earns(reduction, (low, 1.0), learner, shown) is expected
