@@ -17,7 +17,14 @@ from terrain.discrepancy.earned import MIN_RUNS, crossed_runs, held_out_runs
 from terrain.discrepancy.gain import Gain
 from terrain.discrepancy.grounds import simulation_for
 from terrain.discrepancy.held_out import Comparison, filter_gain, repair_held_out, split_runs
-from terrain.discrepancy.learner import Learned, LearnedGain, kept_terms, learn_terms, learned_gains
+from terrain.discrepancy.learner import (
+    Learned,
+    LearnedGain,
+    kept_terms,
+    learn_terms,
+    learned_gains,
+    scattered,
+)
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.runs import (
     LowPass,
@@ -122,7 +129,7 @@ def diagnose_runs(
     last = extended or simulation
     info = problem.at(last.vector)
     noise = without_levels(info.noise, compared)
-    learned = learn_terms(last, problem.signals, compared, problem.low_pass, noise, seed)
+    learned = learn_terms(last, problem.signals, compared, problem.low_pass, noise, seed, scattered(info))
     gains: tuple[LearnedGain, ...] = ()
     with_terms, whole, whole_gain = last.with_learned(kept_terms(learned)), judgement.runs, judgement.gain
     if with_terms is not last and not on.in_turn:

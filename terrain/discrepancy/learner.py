@@ -25,6 +25,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from terrain.discrepancy.compared import ComparedRun
+from terrain.discrepancy.evidence import Evidence
 from terrain.discrepancy.gain import Gain, Interval, removed_by
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.runs import (
@@ -119,7 +120,8 @@ PERCENTILES = (1.0, 99.0)
 KNOTS = (0.25, 0.5, 0.75)
 LEAST_SPREAD = 0.02  #: Standard deviation of an input that can be learned on, in its own unit.
 LAGS_S = (0.1, 0.3, 1.0)  #: Lags over which changes of an input are taken.
-LEVEL = 0.95  #: Probability with which a term gains at all on groups left out.
+LEVEL = 0.997  #: Probability with which a term gains at all on groups left out: of seven channels 2 % err.
+CHANCE = 9.0  #: Quantile of chi square of one degree of freedom with that probability.
 RIDGE = 1e-4  #: Over the square of each product, added to it: products of a dictionary are nearly dependent.
 COLLINEAR = 1e-4  #: Part of a product's square that has to be its own, beside those selected.
 
@@ -146,11 +148,16 @@ def learn_terms(
     low_pass: LowPass,
     noise: Noise,
     seed: int = 0,
+    scattered: Array | None = None,
 ) -> dict[str, Learned]:
     """Return by channel what was learned on runs; of channels that none of them measured nothing.
 
+    What differs from run to run by itself has a mean over few of them, which is no law: of ``n`` runs it takes up
+    to ``CHANCE / n`` of its square away, and a term has to gain more.
+
     Parameters
     ----------
+    scattered : (channels,) square, over all rows, of what differs from run to run by itself, in the channels' units
     simulation : with all named causes built in, and what was learned before
     signals, compared : of the runs, faults repaired; and the same beside the simulation before the causes
     seed : of the groups of the cross-validation, where runs are not of several sessions
@@ -192,6 +199,8 @@ def learn_terms(
         errors = cross_validated(sums)
         reference = float(references[c])
         n = size_of(errors, (1.0 - ENOUGH) * before + ENOUGH * reference)
+        by_chance = 0.0 if scattered is None else CHANCE / len(runs) * float(scattered[c])
+        n = n if errors[:, 0].sum() - errors[:, n].sum() > by_chance else 0
         sizes = np.concatenate([noise.size(run.pace_mps)[:, c] for run in compared])
         noise_std = float(np.sqrt(np.nanmean(sizes**2)))
         left_std = math.sqrt(max(float(errors[:, n].sum()) / n_rows - noise_std**2, 0.0))
@@ -210,6 +219,14 @@ def learn_terms(
         inner_gain, reference_gain = (1.0 - np.array([errors[:, n].sum(), reference]) / before).tolist()
         learned[shown] = Learned(term, inner_gain, reference_gain, left_std, noise_std)
     return learned
+
+
+def scattered(info: Evidence) -> Array:
+    """Return the square (channels,), over all rows, of what differs from run to run by itself."""
+    std = info.nuisance_std[:, None, None]
+    return np.asarray(
+        sum([np.nansum((std * rows.sensitivity[info.nuisances]) ** 2, axis=(0, 1)) for rows in info.rows])
+    )
 
 
 def replay_std(
