@@ -284,7 +284,7 @@ def statement_of(found: Found, judgement: Judgement) -> verdict.Diagnosis:
     built = found.built_in
     values = {cause.name: values_of(fit, cause) for cause in fit.causes}
     for rivals in fit.rivals.values():
-        for name, (change, error) in rivals.items():
+        for name, (change, error, _) in rivals.items():
             values.setdefault(name, _values(effect_named(name), change, error))
     parameters = names_of(built)
     at = [fit.names.index(name) for name in parameters]
@@ -653,9 +653,14 @@ def cause_of(problem: Problem, fit: CauseFit, effect: Effect, reason: str = "") 
 
 
 def values_of(fit: CauseFit, effect: Effect) -> tuple[verdict.Value, ...]:
-    """Return the fitted values of a cause."""
-    at = fit.at(effect)
-    return _values(effect, fit.change[at], np.sqrt(fit.cov[at, at] * fit.tests[effect.name].inflation))
+    """Return the fitted values of a cause; intervals reach to its values beside each member of another set."""
+    at, values = fit.at(effect), []
+    rivals = [rival for of, each in fit.rivals.items() if of != effect.name for rival in each.values()]
+    for own in _values(effect, fit.change[at], np.sqrt(fit.cov[at, at] * fit.tests[effect.name].inflation)):
+        half = own.high - own.value
+        beside = [own.value, *[rival.others[own.name] for rival in rivals if own.name in rival.others]]
+        values.append(own._replace(low=min(beside) - half, high=max(beside) + half))
+    return tuple(values)
 
 
 def _values(effect: Effect, change: Array, std: Array) -> tuple[verdict.Value, ...]:

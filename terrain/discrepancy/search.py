@@ -21,7 +21,7 @@ from terrain.discrepancy.evidence import (
     whiten_run,
 )
 from terrain.discrepancy.runs import LowPass, Signals, Simulation, rows_of
-from terrain.effects import BOUNDS, INDEX, Effect
+from terrain.effects import BOUNDS, INDEX, PARAMETERS, Effect
 from terrain.records import Array
 
 # -- A problem: runs and a simulation; and nonlinear fits of parameters to all of them ---------------------
@@ -73,9 +73,12 @@ class Problem(NamedTuple):
         """
         k, white = len(names), []
         total = np.zeros((1, 1, k + 1, k + 1))
+        planar = {
+            terrain: self.simulation.planar_on(terrain) for terrain in {r.terrain for r in self.signals}
+        }
         for run, around, inner in zip(self.signals, info.white, info.marginal[2], strict=True):
-            planar = self.simulation.planar_on(run.terrain)
-            columns = whiten_run(info.noise, rows_of(run, planar, vector, names, self.low_pass))
+            rows = rows_of(run, planar[run.terrain], vector, names, self.low_pass)
+            columns = whiten_run(info.noise, rows)
             flat = columns.reshape(k + 1, -1)
             along = around[info.nuisances].reshape(len(info.nuisances), flat.shape[1]) @ flat.T
             total += flat @ flat.T - along.T @ inner @ along
@@ -178,8 +181,17 @@ or by what the other causes take over, is no rival of its scale however noisy ot
 PLAUSIBLE_STDS = 2.36
 """Standard deviations by which a rival may be beyond its plausible range: the half of a 95 % interval."""
 
-Rivals = Mapping[str, tuple[Array, Array]]
-"""By effect that fits as well as a cause in its place, the best first, its values and their standard deviations."""
+
+class Rival(NamedTuple):
+    """The fit of an effect in the place of a cause."""
+
+    change: Array  #: (k,) of its parameters
+    std: Array
+    others: Mapping[str, float]  #: changes of the parameters of the other causes beside it
+
+
+Rivals = Mapping[str, Rival]
+"""By effect that fits as well as a cause in its place, the best first."""
 
 
 def rivals_of(
@@ -213,9 +225,13 @@ def rivals_of(
                 std = np.sqrt(np.maximum(np.diag(here.fit(swapped)[1]), 0.0))[places]
                 ends = here.vector[at] + np.outer((-PLAUSIBLE_STDS, PLAUSIBLE_STDS), std)
                 if all(p.is_plausible(*own) for p, own in zip(effect.parameters, ends.T, strict=True)):
-                    as_good.append((behind, effect.name, here.vector[at] - info.vector[at], std))
+                    moved = dict(zip(PARAMETERS, (here.vector - info.vector).tolist(), strict=True))
+                    beside = {name: moved[name] for name in names_of(others)}
+                    as_good.append(
+                        (behind, effect.name, Rival(here.vector[at] - info.vector[at], std, beside))
+                    )
         as_good.sort(key=lambda rival: rival[0])
-        rivals[cause.name] = {name: (change, std) for _, name, change, std in as_good}
+        rivals[cause.name] = {name: rival for _, name, rival in as_good}
     return rivals
 
 

@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from studies.blind_trials.drives import rich_drives
+from studies.blind_trials.trial import hidden_runs
 
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.diagnosed_runs import diagnose_runs
@@ -130,6 +132,36 @@ def test_runs_are_simulated_on_the_soil_of_their_label_where_they_need_it():
     grass, moon, plain = (planar.params.tobytes() for planar in on)
     assert grass == make_planar(AGRIMARO, simulation.grounds["grass"]).params.tobytes() != plain
     assert moon == plain == make_planar(AGRIMARO, Ground()).params.tobytes()
+
+
+LIGHT = """name: light
+drive: skid_steer
+wheel_radius_m: {value: 0.1, unit: m, source: me}
+track_m: {value: 0.36, unit: m, source: me}
+wheelbase_m: {value: 0.26, unit: m, source: me}
+mass_kg: {value: 17.0, unit: kg, source: me}
+"""
+
+
+def test_a_label_does_not_change_what_is_found_of_a_light_robot(tmp_path):
+    """Its wheels slip by 8 %, far from the soil of its label, and it turns as with a track of 0.57 m."""
+    path = tmp_path / "light.yaml"
+    path.write_text(LIGHT)
+    robot, drives = load_robot(path), rich_drives(np.random.default_rng(7), 6, 20.0)
+    hidden = {"effective_track_ratio": 0.57 / 0.36 - 1.0, "ground_slip_ratio": 0.08}
+    runs = [
+        replace(run, streams={name: run.streams[name] for name in ("wheels", "imu", "odometry")})
+        for run in hidden_runs(robot, drives, np.random.SeedSequence(7), hidden)
+    ]
+    found = []
+    for label in ("grass", "zork"):
+        diagnosis = diagnose_runs(relabelled(runs, label), robot, library_of("skid_steer"), 0, 0).diagnosis
+        (track,) = [value for cause in diagnosis.causes for value in cause.parameters]
+        # beside the wheel radius that is of the set the track is another
+        assert 0.36 * (1.0 + track.low) < 0.57 < 0.36 * (1.0 + track.high)
+        assert [{"wheel_radius", "ground_slip"} <= set(names) for names in diagnosis.ambiguous_sets] == [True]
+        found.append((diagnosis.ambiguous_sets, track))
+    assert found[0] == found[1]
 
 
 def test_a_label_that_helps_no_run_changes_nothing():

@@ -233,7 +233,7 @@ def test_an_effect_that_is_little_behind_is_a_rival(monkeypatch, behind, square,
     monkeypatch.setattr(search_module, "wald_test", lambda *_: SimpleNamespace(inflation=inflation))
     rivals = rivals_of(None, info, start, [cause])[cause.name]
     assert list(rivals) == [other.name] * is_rival
-    assert all((change[0], std[0]) == pytest.approx((0.1, 0.01)) for change, std in rivals.values())
+    assert all((change[0], std[0]) == pytest.approx((0.1, 0.01)) for change, std, _ in rivals.values())
 
 
 @pytest.mark.parametrize(("lost", "acts"), [(7.0, True), (19.0, True), (21.0, False)])
