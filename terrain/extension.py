@@ -229,8 +229,8 @@ def _driven(run: RunLog, robot: Robot) -> tuple[Array, Array, Array]:
             for name, zero in zip(robot.steer_channels, robot.steering_zeros_rad, strict=False)
         ]
         if isinstance(robot, BicycleRobot):
-            speed = speed * np.cos(angles[0]) if robot.front_driven else speed
-            return speed, np.asarray(speed * np.tan(angles[0]) / robot.wheelbase_m), grade
+            ahead, _, turn = rolled_twist(robot, rates, angles[0][:, None]).T
+            return ahead, turn, grade
         directions = np.column_stack(angles)
     rollers = robot.on_omni_wheels, robot.roller_angles_rad
     twist, _ = no_slip_twist(robot.wheel_positions_m, directions, rates, *rollers)

@@ -679,8 +679,8 @@ def _rolled(planar: Planar, wheel_speed: Array, steer: Array) -> tuple[Array, Ar
         ahead, left, turn = rollers["to_rolled"] @ wheel_speed.T
         return ahead, 2.0 * rollers["wheel_distance_m"] * turn, left
     if isinstance(robot, BicycleRobot):
-        speed = speed * np.cos(steer[:, 0]) if robot.front_driven else speed
-        return speed, speed * np.tan(steer[:, 0]) * (robot.track_m / robot.wheelbase_m), 0.0 * speed
+        ahead, left, turn = rolled_twist(robot, wheel_speed, steer).T
+        return ahead, robot.track_m * turn, left
     return speed, wheel_speed[:, -1] - wheel_speed[:, 0], np.zeros_like(speed)
 
 

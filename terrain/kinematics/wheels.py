@@ -36,6 +36,8 @@ from terrain.records import Array
 
 #: Of the matrix from twist to wheel speeds, lengths over the size of the robot: beyond, directions agree.
 MAX_CONDITION = 1e6
+#: Steering angle of a car-like robot at the most, where its tangent is 3.6: a larger one is a reading that is off.
+STEEPEST_RAD = 1.3
 
 
 def finite_numbers(name: str, given: Any, size: int, missing: bool = False) -> Array:
@@ -205,7 +207,7 @@ def rolled_twist(robot: Any, wheel_speed_mps: Array, steer_rad: Array) -> Array:
         left, right = wheel_speed_mps[:, 0], wheel_speed_mps[:, -1]
         out[:, 0], out[:, 2] = 0.5 * (left + right), (right - left) / robot.track_m
         return out
-    angle = steer_rad[:, 0]
+    angle = np.clip(steer_rad[:, 0], -STEEPEST_RAD, STEEPEST_RAD)
     out[:, 0] = wheel_speed_mps[:, 0] * np.cos(angle) if robot.front_driven else wheel_speed_mps[:, -1]
     out[:, 2] = out[:, 0] * np.tan(angle) / robot.wheelbase_m
     return out

@@ -143,6 +143,7 @@ from terrain.kernels import filled, inner, njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.commands import wheel_motion
 from terrain.kinematics.wheels import (
+    STEEPEST_RAD,
     point_velocity,
     rolled_twist,
     rolling_matrix,
@@ -578,7 +579,6 @@ SKID = PlanarDrive(SIDES, lambda robot, ground: {"tracked": isinstance(robot, Tr
 SLOW_MPS = 0.01  # speed below which tyres damp a sideways motion as at it: in less than a millisecond
 # The effective wheelbase over the wheelbase at the least, and what is left of an axle's compliance.
 LEAST_RATIO = 0.1
-STEEPEST_RAD = 1.3  # steering angle at the most, where its tangent is 3.6
 
 _AXLES = "wheelbase_m com_ahead_m front_cornering_npr rear_cornering_npr yaw_inertia_kgm2"
 AXLES = record({"body": PLANAR_BODY} | numbers(_AXLES) | {"front_driven": bool})
@@ -596,7 +596,8 @@ def _move_bicycle(params: Array, vector: Array, dt: float, inputs: Inputs) -> Ar
             angle[k] -= min(max(angle[k], -p.steering_dead_zone_rad), p.steering_dead_zone_rad)
     steer = steered(angle + p.steering_offset_front_rad, p, dt)
     wheels = turned_wheels(wheel_speed_mps, p, body.radius_m, dt)
-    driven = wheels[:, 0] * np.cos(steer) if params[0].front_driven else wheels[:, -1]
+    turned = np.cos(np.minimum(np.abs(steer), STEEPEST_RAD))
+    driven = wheels[:, 0] * turned if params[0].front_driven else wheels[:, -1]
     u = driven * (1.0 + p.wheel_radius_ratio)
     speed, rest, slip = slip_along(body, p, dt, u, np.zeros(n), grade_rad, disturbance, True)
     accel = slopes(speed, dt)
