@@ -15,7 +15,7 @@ from terrain.records import RunLog, Stream
 FEW = 3  #: Fewer runs are cut: of three or more some can be held out.
 LONG_S = 55.0  #: Together, from which on runs are long: a drive of a minute.
 PARTS = 16  #: Of all runs together, about.
-SHORTEST_S, LONGEST_S = 10.0, 60.0  #: Of a part: what a low-pass leaves of it, and what changes within it.
+SHORTEST_S, LONGEST_S = 6.0, 60.0  #: Of a part: what a low-pass leaves of it, and what changes within it.
 
 
 def cut_long(runs: Sequence[RunLog]) -> list[RunLog]:
@@ -24,9 +24,9 @@ def cut_long(runs: Sequence[RunLog]) -> list[RunLog]:
     Examples
     --------
     >>> import numpy as np
-    >>> run = RunLog("a", "husky", {"imu": Stream(np.arange(0.0, 65.0, 0.5), np.zeros((130, 1)), ("gyro_z_radps",))})
+    >>> run = RunLog("a", "husky", {"imu": Stream(np.arange(0.0, 60.5, 0.5), np.zeros((121, 1)), ("gyro_z_radps",))})
     >>> [(part.run_id, part.end_s) for part in cut_long([run])][:2], len(cut_long([run] * 3))
-    ([('a_part_01', 10.5), ('a_part_02', 21.0)], 3)
+    ([('a_part_01', 5.5), ('a_part_02', 11.5)], 3)
     """
     whole_s = sum(run.end_s - run.start_s for run in runs)
     if len(runs) >= FEW or whole_s < LONG_S:

@@ -41,4 +41,4 @@ def test_several_or_short_runs_stay_as_they_are():
 def test_what_was_cut_is_stated():
     runs = [run_of(70.0)]
     (sentence,) = cut_note(runs, cut_long(runs))
-    assert "1 long run cut into 6 parts of about 11 s" in sentence
+    assert "1 long run cut into 11 parts of about 6 s" in sentence
