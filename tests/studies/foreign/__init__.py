@@ -8,6 +8,7 @@ calibrated; something changes, and it is asked what.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from importlib.util import find_spec
 
 import numpy as np
 from pydantic import field_validator
@@ -18,6 +19,7 @@ from pipelines.report.tree import Column, Report, Table
 from studies.blind_trials.scoring import Score
 from studies.foreign.scoring import by_effect, table_of
 from studies.foreign.trial import ROWS, Case, ForeignTrial, cases_of, run_case
+from terrain.errors import ConfigError
 
 EXAMPLE = "python tests/studies foreign --n 40 --seed 4001 --rows plain_skid,nothing"
 
@@ -51,9 +53,17 @@ class ForeignResult(Result):
 
 
 def run(settings: Settings, progress: Progress = silent) -> ForeignResult:
-    """Run trials in foreign worlds and return their scores; a trial depends on the seed, its row and its number."""
+    """Run trials in foreign worlds and return their scores; a trial depends on the seed, its row and its number.
+
+    Raises
+    ------
+    ConfigError
+        if rows of MuJoCo are asked for and it is not installed.
+    """
     from joblib import Parallel, delayed
 
+    if any(row.startswith("mujoco_") for row in settings.rows) and not find_spec("mujoco"):
+        raise ConfigError("rows of MuJoCo's scenes need the package mujoco, which is not installed")
     cases: list[Case] = [case for row in settings.rows for case in cases_of(row, settings.n, settings.seed)]
     cases.sort(key=lambda case: (case.engine, case.world))  # a process calibrates few worlds
     trials: list[ForeignTrial] = []

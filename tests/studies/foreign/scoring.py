@@ -47,7 +47,7 @@ def _scores(trials: Sequence[ForeignTrial]) -> Iterator[tuple[str, Score]]:
             )
             yield f"{engine}, {world}: named or in a set", score((t.outcome in named for t in own), **least)
     yield (
-        "nothing hidden: something stated",
+        "nothing hidden: anything stated",
         score((t.outcome is not Outcome.SILENT for t in quiet), most=0.02),
     )
 

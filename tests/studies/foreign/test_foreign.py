@@ -7,13 +7,15 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
+from studies import foreign
 from studies.foreign import physics, scenes, scoring, sensors, trial, worlds
 from studies.foreign.physics import EVERY, G_MPS2, SAMPLE_S, Body, Motion, integrate
 from studies.foreign.scenes import Scene
 from studies.foreign.sensors import Motor, Sensing
-from studies.foreign.trial import Answer, Outcome, cases_of, outcome_of
+from studies.foreign.trial import Answer, ForeignTrial, Outcome, cases_of, outcome_of
 from studies.foreign.worlds import WORLDS, Driven, driven_by, effects_of, runs_of
 from terrain.effects import LIBRARY, library_of
+from terrain.errors import ConfigError
 from terrain.robots import load_robot
 
 SKID = WORLDS["plain", "skid"]().body
@@ -215,3 +217,36 @@ def test_a_scene_drives_as_its_wheels_turn(kind):
         kind, world.body._replace(mass_kg=2 * world.body.mass_kg), Scene(), world.motor, level
     )
     assert not np.array_equal(heavier.motion.speed_x_mps, motion.speed_x_mps)
+
+
+def test_rows_that_cannot_run_are_refused(monkeypatch):
+    with pytest.raises(ConfigError, match="some of plain_skid,"):
+        foreign.Settings(rows="plain_boat")
+    monkeypatch.setattr(foreign, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match="need the package mujoco"):
+        foreign.run(foreign.Settings(rows="mujoco_skid"))
+
+
+def test_the_report_counts_what_was_answered():
+    def of(effect, outcome, answer, row="plain_skid"):
+        fields = {"row": row, "number": 0, "engine": row.partition("_")[0], "world": "skid", "effect": effect}
+        about = {"size": 0.1, "over_limit": 6.0 if effect else 0.0, "inside": True, "right": ("payload",)}
+        return ForeignTrial(
+            **fields, **about, nearest=(), known=(), answer=answer, outcome=outcome, seconds=1.0
+        )
+
+    right = of("payload", Outcome.RIGHT, Answer(causes=("payload",)))
+    wrong = of("payload", Outcome.WRONG, Answer(causes=("scrub",), named={"scrub_ratio": 0.2}))
+    trials = (
+        *(right, right, right, wrong, of("payload", Outcome.SILENT, Answer())),
+        *(of("", Outcome.SILENT, Answer()), of("", Outcome.WRONG, Answer(causes=("scrub",)))),
+    )
+    table = scoring.table_of(trials)
+    assert table["plain: wrong or with false company"][:2] == (1, 5)
+    assert table["plain: right, nearest, in a set or unexplained"][:2] == (3, 5)
+    assert table["plain: silent at 5 times the limit"][:2] == (1, 5)
+    assert table["nothing hidden: anything stated"][:2] == (1, 2)
+    result = foreign.ForeignResult(
+        n=7, seed=0, rows=("plain_skid",), table=table, seconds=(1.0, 1.0), trials=trials
+    )
+    assert "scrub_ratio 0.2" in str(foreign.report(result))

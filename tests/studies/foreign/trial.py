@@ -32,8 +32,8 @@ from terrain.records import RunLog
 from terrain.robots import Robot, load_robot
 from terrain.simulation.plants.planar import Ground, spread_numbers
 
-N_RUNS, N_CALIBRATION = 12, 32  #: of a trial, and those that the description is calibrated on
-MAX_PASSES = 4  #: of the calibration: a builder explains again what an extended description leaves
+N_RUNS, N_CALIBRATION = 12, 24  #: of a trial, and those that the description is calibrated on
+MAX_PASSES = 3  #: of the calibration: a builder explains again what an extended description leaves
 OVER_LIMIT = 6.0  #: size of an effect over its detection limit
 CLOSE = 0.15  #: by which that may be missed
 N_PROBED = 4  #: runs that sizes are found by
