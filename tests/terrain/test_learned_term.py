@@ -13,10 +13,12 @@ from terrain.estimation.live import LiveFilter
 from terrain.extension import correct, correct_live, extended_yaml
 from terrain.learned_term import INPUTS, LearnedTerm, factors_of, learned_lines, read_learned
 from terrain.logs.replay import replay
-from terrain.records import RunLog
+from terrain.records import Command, RunLog
 from terrain.robots import load_robot, robot_from
 from terrain.simulation.plants.planar import Ground
 from terrain.simulation.run import simulate
+from terrain.simulation.scenario import Patch, Scenario
+from terrain.terramechanics.soil import load_soil
 
 HUSKY = load_robot("husky")
 TIME_S = np.arange(1000) / 50
@@ -184,3 +186,25 @@ def test_a_product_is_read_in_each_of_its_forms():
     text += " * change(speed_mps, 0.3)"
     kinds = [factor.kind for factor in factors_of(text)]
     assert kinds == ["1", "moving", "plain", "abs", "sign", "max", "change"]
+
+
+# -- The dynamic plant, in open and in closed loop -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_contacts_of_the_dynamic_plant_move_by_it(closed):
+    robot, soil = load_robot("agrimaro"), load_soil("asphalt")
+    slower = term(SPEED_X, ["speed_mps"], [-0.2], {"speed_mps": (-2.0, 2.0)})
+    twist = np.zeros((300, 3))
+    twist[50:, 0] = 0.6
+    drive = Scenario("straight", 50.0, np.arange(300) / 50.0, twist, (Patch(0.0, soil.name),))
+    given = Command(np.full(3, 0.6 / robot.wheel_radius_m), np.zeros(3), np.array([0.6, 0.0, 0.0]), {})
+    options = {"controller": lambda sample: given} if closed else {}
+    robots = robot, replace(robot, learned=(slower,))
+    truth = [simulate(each, drive, {soil.name: soil}, 0, **options).streams["truth"] for each in robots]
+    plain, learned = (each.channel("speed_x_mps")[-100:].mean() for each in truth)
+    assert learned == pytest.approx(0.8 * plain, rel=0.02)
+    slip = [each.channel("slip_1_ratio")[-100:].mean() for each in truth]
+    assert slip[1] - slip[0] == pytest.approx(
+        0.2, abs=0.02
+    )  # the wheels turn on, and the robot is behind them

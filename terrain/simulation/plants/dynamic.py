@@ -86,7 +86,8 @@ from terrain.errors import ConfigError, DataError, LogError
 from terrain.extension import apply_homes
 from terrain.kernels import filled, inner, is_finite, njit, numbers, record
 from terrain.kinematics.commands import wheel_motion
-from terrain.kinematics.wheels import point_velocity
+from terrain.kinematics.wheels import point_velocity, rolled_twist
+from terrain.learned_term import INPUTS, Factor, rolling_change
 from terrain.logs.schema import unit_of
 from terrain.records import Array, Command, Label, Sample, Stream, read_only
 from terrain.robots import Robot, SwerveRobot, as_drive
@@ -148,13 +149,14 @@ WHEEL_STATE = record(
 STATE = record(
     numbers(
         "position_x_m position_y_m yaw_rad speed_x_mps speed_y_mps yaw_rate_radps path_m accel_x_mps2 "
+        "drift_x_mps drift_y_mps drift_radps "
         "accel_y_mps2 leg_rad"
     )
     | {"wheels": (WHEEL_STATE, 3), "n_steps": int, "late_rad": (float, (MAX_DELAY_STEPS, 3))}
 )
-"""Position is that of the body's origin; speeds and accelerations (dv/dt + w x v, of the step before) are
-those of its centre of mass in body axes; the third leg is at 0 in the middle of its play; ``late_rad`` are
-angles of the encoders that have not reached the wheels yet."""
+"""Position is that of the body's origin; speeds and accelerations (dv/dt + w x v, of the step before) are those of its
+centre of mass in body axes; contacts drift by what was learned of the motion; the third leg is at 0 in the middle of
+its play; ``late_rad`` are angles of the encoders that have not reached the wheels yet."""
 
 
 class TerrainProfile(NamedTuple):
@@ -402,6 +404,9 @@ def step(
         cos_steer, sin_steer = math.cos(heading), math.sin(heading)
         along = cos_steer * v_x + sin_steer * v_y
         across = -sin_steer * v_x + cos_steer * v_y
+        drift_x = state.drift_x_mps - plant.wheels_m[i, 1] * state.drift_radps
+        drift_y = state.drift_y_mps + plant.wheels_m[i, 0] * state.drift_radps
+        drift_along = cos_steer * drift_x + sin_steer * drift_y
         wheel_speed = w.rate_radps * radius_m
         fastest = max(abs(wheel_speed), abs(along))
         # the patch that the wheel is on lies ahead of the body's by its place in the direction of motion
@@ -424,8 +429,8 @@ def step(
         )
         w.ride_mps2 = ride_n / (plant.mass_kg * plant.load_fraction[i])
         normal_n = max(normal_n + ride_n, 0.0)
-        rate_x = wheel_speed - along - fastest / sigma_m * w.deflection_x_m
-        rate_y = -across - fastest / sigma_m * w.deflection_y_m
+        rate_x = wheel_speed - along + drift_along - fastest / sigma_m * w.deflection_x_m
+        rate_y = cos_steer * drift_y - sin_steer * drift_x - across - fastest / sigma_m * w.deflection_y_m
         if plant.yields:
             rate_x -= w.creep_ratio * fastest / sigma_m * w.deflection_x_m
             rate_y -= plant.effects.side_hill_slip_ratio * math.atan(grade_y) * abs(along)
@@ -446,7 +451,7 @@ def step(
         pull = thrust - resistance * math.tanh(along / ROLLING_SPEED_MPS)
         _drive_wheel(plant, w, wheel_radps[i], thrust * radius_m, dt)
         # the contact follows with the wheel's new rate: semi-implicit
-        rate_x = w.rate_radps * radius_m - along - fastest / sigma_m * w.deflection_x_m
+        rate_x = w.rate_radps * radius_m - along + drift_along - fastest / sigma_m * w.deflection_x_m
         deflection = w.deflection_x_m + dt * rate_x
         if plant.yields:  # implicit: a contact that creeps fast is stiff
             deflection /= 1.0 + dt * (w.creep_ratio * fastest / sigma_m)
@@ -691,11 +696,27 @@ def run_dynamic(
         sensor.stamp_s = read_only(stamped[0])
 
     status: list[Mapping[str, float]] = []
+    lags: list[dict[Factor, Array]] = [{} for _ in robot.learned]
+
+    def drift() -> None:
+        """Let the contacts of the next steps move by what was learned of the motion, as the wheels roll now."""
+        wheels, inputs = state["wheels"][0], np.zeros((1, len(INPUTS)))
+        speed = wheels["rate_radps"] * robot.wheel_radius_m
+        inputs[:, :3] = rolled_twist(robot, speed[None], wheels["steer_rad"][None])
+        change = rolling_change(robot.learned, inputs, np.array([1.0 / scenario.rate_hz]), lags)[0]
+        state["drift_x_mps"], state["drift_y_mps"], state["drift_radps"] = change
+
     if controller is None:
         wheels = wheel_motion(robot, scenario.twist, 1 / scenario.rate_hz)
         decided = np.hstack([wheels.twist, wheels.wheel_radps, wheels.steer_rad])
         held = np.repeat(decided, substeps, axis=0)
-        advance(plant, profile, state, held[:, 3:6].copy(), held[:, 6:].copy(), road_noise, rows)
+        every = substeps if robot.learned else n_steps
+        for begin in range(0, n_steps, every):
+            part = slice(begin, begin + every)
+            if robot.learned:
+                drift()
+            given = held[part, 3:6].copy(), held[part, 6:].copy(), road_noise[part]
+            advance(plant, profile, state, *given, rows[part])
     else:
         decided, delay_steps = np.empty((len(scenario.time_s), 9)), max(round(command_delay_s / STEP_S), 1)
         wheel_radps, steer_rad = np.zeros((n_steps, 3)), np.zeros((n_steps, 3))  # in force at each step
@@ -703,6 +724,8 @@ def run_dynamic(
         for k, time_s in enumerate(scenario.time_s.tolist()):
             step = k * substeps
             part, done = slice(done, step + 1), step + 1
+            if robot.learned:
+                drift()
             advance(plant, profile, state, wheel_radps[part], steer_rad[part], road_noise[part], rows[part])
             if not is_finite(state):
                 rows[done:] = filled(BODY_ROW, np.nan)
