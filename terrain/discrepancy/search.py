@@ -385,8 +385,9 @@ def _add_causes(problem: Problem, info: Evidence, causes: list[Effect]) -> tuple
             more, at = _swap_for_better(problem, at, more)
         if frozenset(more) not in seen:
             seen.add(frozenset(more))
-            barred, causes, info = set(), more, at
-        barred |= {effect.name for effect in new if effect not in causes}
+            barred, causes, info = set(), more, at  # one that another replaced may come in beside it
+        else:
+            barred |= {effect.name for effect in new}
     return causes, info
 
 

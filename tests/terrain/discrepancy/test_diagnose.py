@@ -30,7 +30,7 @@ OF_WHEELS_AND_CURRENTS = {
     ),
     "agrimaro": (
         "steering_offset_2 steering_backlash encoder_lag gyro_scale accel_bias force_slip viscous_drag "
-        "wheel_scale_2 current_offset"
+        "wheel_scale_2 current_offset gyro_nonlinearity"
     ),
 }
 """Effects of wheels, steering, sensors, clocks, masses, motors and the ground; some of each robot."""
@@ -40,6 +40,11 @@ WITHOUT_CURRENTS = (
     ("adap2e", {"side_hill_slip_ratio": 0.15}),
     ("adap2e", {"steering_offset_front_rad": 0.01}),
     ("adap2e", {"steering_backlash_rad": 0.01}),
+    ("adap2e", {"steering_gain_ratio": 0.1}),
+    ("agrimaro", {"steering_lag_s": 0.15}),
+    ("adap2e", {"steering_lag_s": 0.2}),
+    ("adap2e", {"steering_dead_zone_rad": 0.02}),
+    ("adap2e", {"wheel_dead_zone_mps": 0.03}),
     ("marmotte", {"side_hill_slip_ratio": 0.2}),
     ("marmotte", {"ground_slip_ratio": 0.1}),
     ("patako", {"force_slip_ratio": 0.4}),
@@ -170,6 +175,23 @@ def test_two_effects_are_named_beside_a_run_that_is_unfit_and_half_of_one_where_
         with pytest.raises(DataError, match=message) as error:
             diagnose(given, world.simulation)
         assert "\n" not in str(error.value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("robot", "half_rad"), [("husky", 0.15), ("adap2e", 0.2), ("marmotte", 0.1)])
+def test_backlash_of_the_drive_is_named_a_little_too_small(worlds, robot, half_rad):
+    """The common low-pass rounds the reversals off, which hides up to some hundredths of a radian of it."""
+    diagnosis = diagnose(worlds(robot).runs({"drive_backlash_rad": half_rad}), worlds(robot).simulation)
+    assert named(diagnosis) == ["drive_backlash"]
+    assert 0.85 * half_rad < diagnosis.values["drive_backlash_rad"] < half_rad
+
+
+@pytest.mark.slow
+def test_an_effect_that_another_takes_the_place_of_comes_in_beside_it(worlds):
+    hidden = {"turning_resistance_ratio": 0.7, "effective_track_ratio": 0.6}
+    diagnosis = diagnose(worlds("husky").runs(hidden), worlds("husky").simulation)
+    assert sorted(named(diagnosis)) == ["effective_track", "turning_resistance"]
+    assert are_right(diagnosis, hidden)
 
 
 def test_an_effect_of_no_library_or_without_its_entry_is_unexplained(worlds):
