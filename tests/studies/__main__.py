@@ -20,6 +20,7 @@ STUDIES = {
     "long-drives": "yaw of a filter on long drives, and after the loss of the camera",
     "intervals": "coverage of the intervals of all that is identified",
     "adaptation": "what adapting to a session gives, by changes hidden in held-out runs",
+    "written-faults": "faults written into measured logs: which are named, and that none is stated that is not there",
     "labels": "what chosen questions and self-training gain, from few labels",
     "foreign": "hide effects in simulators of other equations, and in MuJoCo, explain them, count",
     "trials": "hide effects in simulated runs, diagnose them blindly, count what is right",
@@ -40,7 +41,7 @@ def main(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help"):
         print("python tests/studies NAME [options]\n")
         for name, text in STUDIES.items():
-            print(f"  {name:<13}{text}")
+            print(f"  {name:<15}{text}")
         return 0
     try:
         if words[0] not in STUDIES:

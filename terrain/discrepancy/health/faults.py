@@ -24,7 +24,7 @@ from terrain.discrepancy.health.fault import (
     fault_of,
     session_of,
 )
-from terrain.discrepancy.health.offsets import offset_faults
+from terrain.discrepancy.health.offsets import drift_faults, offset_faults
 from terrain.discrepancy.health.readings import Reading, reading_of, turned_fault
 from terrain.discrepancy.health.samples import lost_samples
 from terrain.discrepancy.health.units import unit_faults
@@ -88,7 +88,9 @@ def faults_of(
             break
     for fault in unit_faults(responses(), sessions, robot):
         repair(fault)
-    return (*faults, *offset_faults(responses(), sessions, robot))
+    for fault in offset_faults(responses(), sessions, robot):
+        repair(fault)
+    return (*faults, *drift_faults(responses(), sessions, robot))
 
 
 def _lost_samples(

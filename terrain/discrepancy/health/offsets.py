@@ -1,4 +1,4 @@
-"""Constant offsets of sensors that no bias of the catalogue reaches: sensors not zeroed, or turned."""
+"""Zeros of sensors: offsets that no bias of the catalogue reaches, of sensors not zeroed, and zeros that drift."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from terrain.discrepancy.health.agreement import LEAST, G, H
-from terrain.discrepancy.health.fault import KINDS, Change, Fault, FaultKind, FaultStatus, fault_of
+from terrain.discrepancy.health.fault import KINDS, Change, Column, Fault, FaultKind, FaultStatus, fault_of
 from terrain.discrepancy.health.sessions import faulty_runs, halves
 from terrain.discrepancy.runs import Rows
 from terrain.robots import Robot
@@ -49,6 +49,52 @@ def offset_faults(runs: Sequence[Rows], sessions: Sequence[str], robot: Robot) -
         confirmed = FaultStatus.CONFIRMED if len(shown) > 1 else FaultStatus.NOT_CONFIRMED
         faults.append(fault._replace(status=confirmed))
     return tuple(faults)
+
+
+#: A zero drifts by that over a run, in the unit of the column, and by so many standard deviations; in runs that
+#: contradict it does so by less than half, to an error of a third.
+DRIFTS = {Column.GYRO: 0.05, Column.ACCEL: 0.5}
+DRIFT_SIGMAS = 6.0
+
+
+def drift_faults(runs: Sequence[Rows], sessions: Sequence[str], robot: Robot) -> tuple[Fault, ...]:
+    """Return columns whose zero drifts along runs, by the same rate in two halves of them, and no channel beside it."""
+    faults, ids = [], [run.run_id for run in runs]
+    for column, least in DRIFTS.items():
+        c = KINDS[column].channels[0]
+        rate, std, other = (np.array(each) for each in zip(*(_drift_of(run, c) for run in runs), strict=True))
+        last_s = np.array([run.time_s[-1] - run.time_s[0] if run.time_s.size else 0.0 for run in runs])
+        clear = (np.abs(rate) > DRIFT_SIGMAS * std) & ~(np.abs(other - rate) < 0.5 * np.abs(rate))
+        shows = clear & (np.abs(rate) * last_s > least)
+        against = (std * last_s < least / 3) & (np.abs(rate) * last_s < least / 2)
+        has = faulty_runs(sessions, np.where(shows, 1, np.where(against, -1, 0)))
+        shown = [i for i in has if shows[i]]
+        if len(shown) < 2:
+            continue
+        middle = [float(np.median(rate[part])) for part in halves(shown)]
+        if abs(middle[1] - middle[0]) > SAME_RATIO * abs(middle[0]):
+            continue
+        change = Change(FaultKind.DRIFT, column, drift=-float(np.median(rate[shown])))
+        faults.append(fault_of(change, has, ids, "", robot))
+    return tuple(faults)
+
+
+def _drift_of(run: Rows, channel: int) -> tuple[float, float, float]:
+    """Return the rate of a channel's zero, its standard deviation, and that of the channel of the same motion."""
+    found: list[tuple[float, float]] = []
+    for c in (channel, WITNESS.get(channel, channel)):
+        known = np.isfinite(run.measured[:, c]) & np.isfinite(run.predicted[:, c])
+        measured, predicted = run.measured[known, c], run.predicted[known, c]
+        if known.sum() < MIN_ROWS:
+            return (*(found or [(math.nan, math.nan)])[0], math.nan)
+        varies = np.std(predicted) > LEAST[c]
+        time_s = run.time_s[known] - run.time_s[known].mean()
+        basis = np.column_stack([time_s, np.ones(measured.size), *([predicted] if varies else [])])
+        fit, *_ = np.linalg.lstsq(basis, measured, rcond=None)
+        n_independent = max(measured.size * min(run.period_s, 1.0), 1.0)
+        spread = np.linalg.pinv(basis.T @ basis / measured.size)[0, 0] / n_independent
+        found.append((float(fit[0]), float(np.std(measured - basis @ fit) * np.sqrt(spread))))
+    return *found[0], found[1][0] if channel in WITNESS else math.nan
 
 
 def constant_of(run: Rows, channel: int) -> tuple[float, float]:

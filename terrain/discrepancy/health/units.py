@@ -47,6 +47,9 @@ CURRENT_GAIN = (0.7, 1.2)
 #: Evidence that a unit has to bring, in minus twice the log-likelihood: four standard deviations.
 COST = 16.0
 LEFT = 9.0  #: Cost of the gains under the right reading, at most: three standard deviations.
+#: Wheels do not turn so many times faster than the maker states, at the quantile of a run; the cost of a reading by
+#: which they do.
+OVERSPEED, PACE_QUANTILE, IMPOSSIBLE = 1.5, 0.9, 1e3
 UNIT_TIE = 1.5  #: Readings whose costs differ by less cannot be distinguished: their odds are within 2.
 #: A unit is that of all runs if so many of those that measure its column show it; a wheel that slips as if it was read
 #: in another unit does so by a factor that scatters, in the logarithm, over the second: but none slips by e^ the third.
@@ -84,7 +87,10 @@ def unit_faults(runs: Sequence[Rows], sessions: Sequence[str], robot: Robot) -> 
     informed = np.flatnonzero(clear.any(axis=1)).tolist()
     measures = np.array([np.isfinite(run.measured[:, keys]).any(axis=0) for run in runs])
     options = changes, adds = options_of(logs, robot)
-    own = {i: likeliest(logs[i], options, robot)[0] for i in informed}
+    pace_mps = np.array(
+        [np.quantile(run.pace_mps, PACE_QUANTILE) if run.time_s.size else 0.0 for run in runs]
+    )
+    own = {i: likeliest(logs[i], options, robot, pace_mps[i])[0] for i in informed}
     suggested = [changes.index(each) for each in {each for each in own.values() if each}]
     if not suggested:
         return ()
@@ -115,17 +121,21 @@ def unit_faults(runs: Sequence[Rows], sessions: Sequence[str], robot: Robot) -> 
         )
         return Fault(change, fault.run_ids, sentence, left_out, FaultStatus.UNDECIDED, others)
 
+    def of_runs_at(places: Sequence[int]) -> tuple[Changes, list[Changes]]:
+        """Return the reading of the medians of some runs with its rivals."""
+        some = list(places)
+        return likeliest(medians(logs[some]), options, robot, float(np.median(pace_mps[some])))
+
     def shown_by(places: Sequence[int]) -> tuple[Changes, list[Changes]]:
         """Return the reading of some runs with its rivals; none where halves of them differ, or few show it."""
-        best, rivals = likeliest(medians(logs[list(places)]), options, robot)
+        best, rivals = of_runs_at(places)
         equal = {best, *rivals}
         for change in best:
             moves = np.nan_to_num(adds[changes.index((change,))]) != 0.0
             shows = [i for i in places if (clear[i] & moves).any()]
             scatter = 1.48 * medians(np.abs(logs[shows] - medians(logs[shows])))[moves]
             steady = not (np.nan_to_num(scatter) > STEADY).all() or abs(math.log(change.factor)) > GROSS
-            parts = [medians(logs[part]) for part in halves(shows) if part]
-            alike = all({each for each, *_ in [likeliest(part, options, robot)]} <= equal for part in parts)
+            alike = all(of_runs_at(part)[0] in equal for part in halves(shows) if part)
             n_measured = int((measures[list(every)] & moves).any(axis=1).sum())
             if not (steady and alike and len(shows) >= MIN_SHOWN_RATIO * n_measured):
                 return (), []
@@ -205,8 +215,13 @@ def _after(logs: Array, adds: Array) -> Array:
     return np.asarray(after)
 
 
-def likeliest(logs: Array, options: Options, robot: Robot) -> tuple[Changes, list[Changes]]:
-    """Return the reading whose gains are likeliest by their prior, and those that are hardly less likely."""
+def likeliest(
+    logs: Array, options: Options, robot: Robot, pace_mps: float = math.nan
+) -> tuple[Changes, list[Changes]]:
+    """Return the reading whose gains are likeliest by their prior, and those that are hardly less likely.
+
+    None is under which the wheels, at ``pace_mps`` as they are logged, are faster than the motors can turn them.
+    """
     changes, adds = options
     gyro, speed, accel, current, heading = _after(logs, adds).T
     mean, below, above = SKID_TURN if robot.skids else SWERVE_TURN
@@ -221,6 +236,10 @@ def likeliest(logs: Array, options: Options, robot: Robot) -> tuple[Changes, lis
     )
     cost = np.nansum(np.square(terms), axis=0)
     n_changes = np.array([len(each) for each in changes])
+    if robot.describes("motors") and math.isfinite(pace_mps):
+        scale = np.array([math.prod([each.factor for each in some if each.of_wheels]) for some in changes])
+        top_mps = robot.motors.speed_max_radps * robot.wheel_radius_m
+        cost = cost + IMPOSSIBLE * (scale * pace_mps > OVERSPEED * top_mps)
     total = cost + COST * n_changes
     best = int(np.argmin(total))
     if not changes[best] or cost[best] > LEFT:
