@@ -78,7 +78,7 @@ def faults_of(
             own = agreement_of(on_own_clocks([without(change, i) for i in places], latencies))
             for whole, part in zip(after, own, strict=True):
                 whole[list(places)] = part
-            return reading_of(change, before, after)
+            return reading_of(change, before, after, robot.sideways)
 
         turned = turned_fault(before, tried, ids, sessions, robot)
         if turned is None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.health.agreement import FOLLOWERS, Agreement, H
+from terrain.discrepancy.health.agreement import FOLLOWERS, MOTION, Agreement, H, Y
 from terrain.discrepancy.health.fault import (
     KINDS,
     Change,
@@ -41,6 +41,8 @@ LOSS = 0.1  #: Largest loss of correlation of any other channel under a reading 
 GAIN = 20.0
 #: Readings whose gains differ by less, or by less than that ratio, cannot be distinguished.
 TIE, TIE_RATIO = 10.0, 0.03
+#: Ratio to the runs that a reading mends, of those of its sessions that another does and it does not.
+MAX_OTHER_RATIO = 0.25
 MIN_MENDED_RATIO = 0.8  #: Ratio of the runs that a reading has to mend, to be as good as another.
 
 WORDS = (
@@ -78,16 +80,20 @@ def candidate_changes(robot: Robot) -> Changes:
     return (*changes, *(Change(sign, Column.WHEELS, -1.0, wheel) for wheel in (-1, *each)))
 
 
-def reading_of(change: Change, before: Agreement, after: Agreement) -> Reading:
-    """Return what a change makes of runs."""
-    old, new = before.correlation[:, FOLLOWERS], after.correlation[:, FOLLOWERS]
+def reading_of(change: Change, before: Agreement, after: Agreement, sideways: bool = False) -> Reading:
+    """Return what a change makes of runs; the lateral speed of a robot that drives sideways follows its wheels too."""
+    followers = [*FOLLOWERS, Y] if sideways else FOLLOWERS
+    old, new = before.correlation[:, followers], after.correlation[:, followers]
     gain = after.likelihood.sum(axis=1) - before.likelihood.sum(axis=1)
     turned = (old < TURNED) & (new > RIGHT)
     asked = old != 0.0  # what a run does not show cannot be wrong in it
     mended = (asked & (turned | ((new - old > RISE) & (new > CLEAR)))).any(axis=1)
     worse = ((new < old - LOSS) & (old > RIGHT)).any(axis=1)
     suits = ~worse & (gain > GAIN)
-    return Reading(change, after.correlation, gain, mended & suits, suits)
+    # under the right reading nothing is predicted to move that rests, and what is turned may be another fault
+    motion = after.correlation[:, MOTION]
+    dead = ((motion != 0.0) & (np.abs(motion) < TURNED)).any(axis=1)
+    return Reading(change, after.correlation, gain, mended & suits & ~dead, suits)
 
 
 def turned_fault(
@@ -104,7 +110,7 @@ def turned_fault(
     images, left for right or ahead for back: no channel tells which it is, and the diagnosis is that of either but for
     the side.
     """
-    fit = before.correlation[:, FOLLOWERS]
+    fit = before.correlation[:, [*FOLLOWERS, Y] if robot.sideways else FOLLOWERS]
     suspects = np.flatnonzero(((fit != 0.0) & (fit < RIGHT)).any(axis=1)).tolist()
     readings = [tried(change, suspects) for change in candidate_changes(robot)] if suspects else []
     readings = [reading for reading in readings if reading.mends.any()]
@@ -117,12 +123,18 @@ def turned_fault(
         if not shown:
             continue
         parts, equal = halves(shown), {change, *rivals}
+        # of runs in which it gains nothing another reading gains in many: then neither is that of the session
+        own = {sessions[i] for i in has}
+        left = [i for i in range(len(ids)) if sessions[i] in own and not best.gain[i] > GAIN]
+        others = [each.change for each in readings if left and each.change not in equal]
+        if any(tried(each, left).suits[left].sum() > MAX_OTHER_RATIO * len(shown) for each in others):
+            continue
         if parts[1] and not all(equal & {*_equal_readings(readings, part)} for part in parts):
             continue
         seen = _evidence(before, best, shown)
         if rivals:
-            others = " or ".join(change_in_words(rival, robot)[0] for rival in rivals)
-            seen += f" (these channels cannot distinguish it from another reading: {others})"
+            alike = " or ".join(change_in_words(rival, robot)[0] for rival in rivals)
+            seen += f" (these channels cannot distinguish it from another reading: {alike})"
         fault = fault_of(change, has, ids, seen, robot)
         if not parts[1]:
             return fault._replace(status=FaultStatus.NOT_CONFIRMED)

@@ -76,7 +76,8 @@ def lost_samples(run: Signals, beside: Rows) -> Iterator[LostSamples]:
         spread = float(np.std(expected)) if expected.size else 0.0
         if not spread > 0:
             continue
-        mask, lost_s, at = held(values, run.dt_s, c in MOTION), 0.0, 0.0
+        end_mask = clipped(values, run.dt_s)
+        mask, lost_s, at = held(values, run.dt_s, c in MOTION) & ~end_mask, 0.0, 0.0
         for start, end in true_stretches(mask):
             start_s, end_s, is_zero = start * run.dt_s, (end - 1) * run.dt_s, values[start] == 0.0
             margin_s = MARGIN_S if end_s - start_s >= FROZEN_S else 0.0
@@ -95,7 +96,7 @@ def lost_samples(run: Signals, beside: Rows) -> Iterator[LostSamples]:
                 lost_s, at = lost_s + end_s - start_s, float(values[start])
         if lost_s > 0.0:
             yield LostSamples(int(c), False, lost_s, at)
-        at_end = np.flatnonzero(clipped(values, run.dt_s))
+        at_end = np.flatnonzero(end_mask)
         if (
             at_end.size
             and np.std(np.interp(at_end * run.dt_s, beside.time_s, expected)) > CLIPPED_SPREAD * spread

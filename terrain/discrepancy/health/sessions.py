@@ -13,7 +13,7 @@ import numpy as np
 from terrain.records import Array
 
 #: A session has a fault if that ratio of the runs that can say so do.
-MIN_RATIO = 0.9
+MIN_RATIO = 0.8
 #: Of a session with fewer, successive runs have it if they are so many, and so large a part of those that can say so.
 MIN_STRETCH, MIN_STRETCH_RATIO = 3, 0.2
 #: What a run that contradicts costs, in runs that confirm.

@@ -141,9 +141,17 @@ def unit_faults(runs: Sequence[Rows], sessions: Sequence[str], robot: Robot) -> 
                 return (), []
         return best, rivals
 
-    # those that would show it if they had one of the units that others seem to have
-    moved = np.nan_to_num(adds[suggested]).any(axis=0)
-    usual = [i for i in informed if not own[i] and (np.isfinite(logs[i]) & moved).any()]
+    # those that contradict: with the units that others seem to have, their gains are less likely
+    usual = []
+    for i in (i for i in informed if not own[i]):
+        cost = costs_of(logs[i], options, robot, pace_mps[i])
+        if (np.isfinite(logs[i]) & np.nan_to_num(adds[suggested]).any(axis=0)).any():
+            usual += [i] if cost[suggested].min() > cost[0] else []
+    n_of = {
+        name: [sum(sessions[i] == name for i in some) for some in (usual, [i for i in own if own[i]])]
+        for name in dict.fromkeys(sessions)
+    }
+    sound = {name for name, (n, n_own) in n_of.items() if n and n >= MIN_USUAL_RATIO * (n + n_own)}
     faults, left = [], set(range(len(logs)))
     parts = [
         range(len(logs)),
@@ -155,7 +163,7 @@ def unit_faults(runs: Sequence[Rows], sessions: Sequence[str], robot: Robot) -> 
         n_own = sum(bool(own[i]) for i in asks)
         if n_own and n_usual < MIN_USUAL_RATIO * (n_usual + n_own):
             best, rivals = shown_by(asks)
-            has = [i for i in every if i in left and i not in usual]
+            has = [i for i in every if i in left and sessions[i] not in sound]
             faults += [fault(best, change, rivals, has) for change in best]
             left -= set(has) if best else set()
     if not usual:
@@ -218,9 +226,22 @@ def _after(logs: Array, adds: Array) -> Array:
 def likeliest(
     logs: Array, options: Options, robot: Robot, pace_mps: float = math.nan
 ) -> tuple[Changes, list[Changes]]:
-    """Return the reading whose gains are likeliest by their prior, and those that are hardly less likely.
+    """Return the reading whose gains are likeliest by their prior, and those that are hardly less likely."""
+    changes, _ = options
+    cost = costs_of(logs, options, robot, pace_mps)
+    n_changes = np.array([len(each) for each in changes])
+    total = cost + COST * n_changes
+    best = int(np.argmin(total))
+    if not changes[best] or cost[best] > LEFT:
+        return (), []
+    near = (total - total[best] < UNIT_TIE) & (n_changes == n_changes[best])
+    return changes[best], [changes[i] for i in np.flatnonzero(near).tolist() if i != best]
 
-    None is under which the wheels, at ``pace_mps`` as they are logged, are faster than the motors can turn them.
+
+def costs_of(logs: Array, options: Options, robot: Robot, pace_mps: float = math.nan) -> Array:
+    """Return what gains cost by their prior under each reading, in minus twice the log-likelihood.
+
+    It is large of one under which the wheels, at ``pace_mps`` as they are logged, are faster than motors turn them.
     """
     changes, adds = options
     gyro, speed, accel, current, heading = _after(logs, adds).T
@@ -235,14 +256,8 @@ def likeliest(
         (current - CURRENT_GAIN[0]) / CURRENT_GAIN[1],
     )
     cost = np.nansum(np.square(terms), axis=0)
-    n_changes = np.array([len(each) for each in changes])
     if robot.describes("motors") and math.isfinite(pace_mps):
         scale = np.array([math.prod([each.factor for each in some if each.of_wheels]) for some in changes])
         top_mps = robot.motors.speed_max_radps * robot.wheel_radius_m
         cost = cost + IMPOSSIBLE * (scale * pace_mps > OVERSPEED * top_mps)
-    total = cost + COST * n_changes
-    best = int(np.argmin(total))
-    if not changes[best] or cost[best] > LEFT:
-        return (), []
-    near = (total - total[best] < UNIT_TIE) & (n_changes == n_changes[best])
-    return changes[best], [changes[i] for i in np.flatnonzero(near).tolist() if i != best]
+    return np.asarray(cost)

@@ -18,8 +18,10 @@ from terrain.discrepancy.clocks import latencies_of, shifts_of
 from terrain.discrepancy.health.agreement import AMPS, A, Agreement, G, X, agreement_of, on_own_clocks
 from terrain.discrepancy.health.fault import Change, Column, FaultKind, FaultStatus, repaired
 from terrain.discrepancy.health.faults import faults_of
+from terrain.discrepancy.health.offsets import constant_of
 from terrain.discrepancy.health.readings import reading_of
 from terrain.discrepancy.health.response import odd_runs, stalled_runs
+from terrain.discrepancy.health.sessions import faulty_runs
 from terrain.discrepancy.health.unfit import clocks_of, unfit_runs
 from terrain.discrepancy.health.units import KEYS, likeliest, options_of
 from terrain.discrepancy.runs import Simulation, low_pass_of, rows_of, signals_of
@@ -27,6 +29,7 @@ from terrain.effects import CHANNELS, GYRO, HEADING, SPEED_X
 from terrain.errors import DataError
 from terrain.records import Stream
 from terrain.robots import load_robot
+from terrain.signals import low_pass
 from terrain.simulation.plants.planar import Ground, spread_numbers
 from terrain.simulation.run import simulate
 from terrain.simulation.scenario import Conditions, make_scenario
@@ -537,6 +540,118 @@ def test_short_runs_of_a_wrong_simulation_measure_clocks_together():
         "clock_offset_s": pytest.approx(-0.27, abs=0.03),
         "camera_latency_s": pytest.approx(0.16, abs=0.04),
     }
+
+
+# -- Each rule with its innocent twin --------------------------------------------------------------------------
+
+
+def on_ice(run, rng):
+    """Return a run whose body follows its wheels late and little, and slides by itself."""
+    time_s = np.arange(0.0, 60.0, 0.02)
+    slides = low_pass(rng.normal(size=(time_s.size, 3)), 0.02, 4.0) * [8.0, 4.0, 6.0]
+    streams = dict(run.streams)
+    for name, channel, k in (
+        ("imu", "gyro_z_radps", 2),
+        ("odometry", "speed_x_mps", 0),
+        ("odometry", "speed_y_mps", 1),
+    ):
+        was = streams[name]
+        values, at = was.values.copy(), was.channels.index(channel)
+        own = low_pass(values[:, at : at + 1], 1.0 / was.rate_hz, rng.choice([0.5, 2.5, 5.0]))[:, 0]
+        values[:, at] = rng.choice([0.15, 0.4]) * own + np.interp(
+            was.time_s - was.time_s[0], time_s, slides[:, k]
+        )
+        streams[name] = replace(was, values=values)
+    return replace(run, streams=streams)
+
+
+def test_a_body_that_slides_on_ice_is_no_fault_of_the_logs():
+    rng = np.random.default_rng(0)
+    runs = [on_ice(run, rng) for run in runs_of(40, 0.1)]
+    assert faults(on_one_clock(runs)) == ()
+
+
+def test_runs_of_a_fault_are_sessions_or_successive_ones():
+    a, b = ["a"] * 6, ["b"] * 6
+    assert faulty_runs(a + b, np.array([1, 0, 1, 1, 1, 1] + [-1] * 6)) == [0, 1, 2, 3, 4, 5]
+    assert faulty_runs(a, np.array([-1, -1, 1, 1, 1, -1])) == [2, 3, 4]
+    assert faulty_runs(a, np.array([-1, -1, 1, 1, -1, -1])) == []  # two are no change of a logger
+    assert faulty_runs(a + b, np.array([1] * 6 + [0] * 6)) == list(range(12))  # nothing says that b has not
+
+
+def with_axes(run, order):
+    """Return a run whose IMU has all axes, those of the gyro in some order."""
+    imu, rng = run.streams["imu"], np.random.default_rng(0)
+    names = ("gyro_x_radps", "gyro_y_radps", "accel_y_mps2", "accel_z_mps2")
+    others = [name for name in names if name not in imu.channels]
+    values = np.column_stack([imu.values, rng.normal(0.0, 0.02, (len(imu.values), len(others)))])
+    channels, axes = [*imu.channels, *others], [f"gyro_{axis}_radps" for axis in "xyz"]
+    at = [channels.index(name) for name in axes]
+    values[:, at] = values[:, [at["xyz".index(axis)] for axis in order]]
+    return replace(run, streams={**run.streams, "imu": Stream(imu.time_s, values, tuple(channels))})
+
+
+def test_a_gyro_whose_axes_are_exchanged_is_read_from_the_axis_that_follows_the_wheels():
+    signals = on_one_clock([with_axes(run, "zyx") for run in sound()])
+    (fault,) = faults(signals)
+    assert (fault.change.kind, fault.change.column) == (FaultKind.AXES, Column.GYRO)
+    assert "gyro_z_radps is in gyro_x_radps" in fault.sentence
+    true = on_one_clock([with_axes(run, "xyz") for run in sound()])
+    for run, right in zip(repaired(signals, [fault]), true, strict=True):
+        assert_allclose(run.measured, right.measured)
+    assert faults(true) == ()
+
+
+def test_samples_that_are_held_or_clipped_are_left_out_and_named():
+    def held_from(t, w):
+        return np.where((t > 8) & (t < 14), w[np.argmax(t > 8)], w)
+
+    for change, kind in (
+        (held_from, FaultKind.DROPOUT),
+        (lambda t, w: np.where((t > 9) & (t < 10.5), 0.0, w), FaultKind.DROPOUT),
+        (lambda t, w: np.clip(w, *np.quantile(w, [0.1, 0.9])), FaultKind.SATURATION),
+    ):
+        runs = [of_gyro(change)(run) if i in (2, 3) else run for i, run in enumerate(sound())]
+        signals = on_one_clock(runs)
+        (fault,) = faults(signals)
+        assert (fault.change.kind, fault.change.column) == (kind, Column.GYRO)
+        fixed = repaired(signals, [fault])
+        assert set(fault.run_ids) <= {runs[2].run_id, runs[3].run_id}
+        lost = [np.isnan(run.measured[:, G]).mean() for run in fixed if run.run_id in fault.run_ids]
+        assert all(0.02 < ratio < 0.5 for ratio in lost)
+
+
+def test_an_offset_is_not_beyond_what_was_measured_and_not_where_the_heading_has_it_too():
+    runs = [with_lidar(run, 0.0) for run in sound(wide=True)]
+    gyro = edit(lambda _, v: v + 0.9, **GYRO_Z)
+    (fault,) = faults(on_one_clock([gyro(run) for run in runs]))
+    assert (fault.change.kind, fault.change.column) == (OFFSET, Column.GYRO)
+    both = edit(lambda _, v: v + 0.9, **GYRO_Z, lidar="yaw")  # it turns, and its wheels do not say so
+    assert not [f for f in faults(on_one_clock([both(run) for run in runs])) if f.change.kind is OFFSET]
+    (rows,), _ = rows_and_low_pass(on_one_clock(sound()[1:2]), simulation_of(HUSKY))
+    far = rows._replace(predicted=rows.predicted + 5.0)  # never near rest
+    assert np.isnan(constant_of(far, G)).all()
+    assert np.isfinite(constant_of(rows, G)).all()
+
+
+def test_a_zero_that_drifts_in_all_runs_is_named_and_one_that_wanders_is_not():
+    drifts = [of_gyro(lambda t, w: w + 0.006 * t)(run) for run in sound()]
+    (fault,) = faults(on_one_clock(drifts))
+    assert (fault.change.kind, fault.change.column) == (FaultKind.DRIFT, Column.GYRO)
+    assert fault.change.drift == pytest.approx(-0.006, rel=0.1)
+    signs = [
+        of_gyro(lambda t, w, s=s: w + 0.006 * s * t)(r) for s, r in zip([1, -1] * 3, sound(), strict=True)
+    ]
+    assert not [f for f in faults(on_one_clock(signs)) if f.change.kind is FaultKind.DRIFT]
+
+
+def test_wheels_faster_than_their_motors_are_in_another_unit_also_without_a_speed_over_ground():
+    """A gyro that reads a seventh of the prediction may be that of a robot that skids."""
+    logs = np.array([{G: np.log(0.6 / 3.6)}.get(c, np.nan) for c in KEYS])
+    options = options_of(logs[None], HUSKY)
+    assert likeliest(logs, options, HUSKY, 0.9) == ((), [])
+    changes, rivals = likeliest(logs, options, HUSKY, 3.2)
+    assert {change.column for each in (changes, *rivals) for change in each} == {Column.WHEELS}
 
 
 # -- Measured logs: no fault, wheels and lidar of one robot that are late, runs of another that are stuck -----
