@@ -328,7 +328,9 @@ def drawn_runs(source: Source, data: Path, seed: int) -> list[RunLog]:
 
 def stated(diagnosis: Diagnosis) -> tuple[dict[str, float], dict[str, float]]:
     """Return what a diagnosis states, and what it states as one of several: faults and values of parameters."""
-    named: dict[str, float] = {f"{fault.change.kind}/{fault.change.column}": 0.0 for fault in diagnosis.faults}
+    named: dict[str, float] = {
+        f"{fault.change.kind}/{fault.change.column}": 0.0 for fault in diagnosis.faults
+    }
     several = {f"{each.kind}/{each.column}": 0.0 for fault in diagnosis.faults for each in fault.rivals}
     named |= diagnosis.values
     for values in diagnosis.ambiguous_values.values():
