@@ -178,6 +178,11 @@ def channels_that_matter(result: ExplainResult) -> list[ChannelVerdict]:
 def answer_of(result: ExplainResult) -> str:
     """Return what is wrong and what that is worth, in one sentence in the words of who built the robot."""
     robot, channels = result.diagnosis.robot, channels_that_matter(result)
+    learned = [gain for gain in result.diagnosed.learned_gains if gain.is_kept]
+    if not channels and learned:
+        says, removes = learned[0].says, percent_text(learned[0].reduction)
+        of = f"the squared error of the {CHANNEL_WORDS[learned[0].channel][0]}"
+        return f"No name fits what these runs show of {robot}: {says}; a learned term of it removes {removes} of {of}."
     if not channels:
         return f"These runs show nothing that the simulation of {robot} gets wrong."
     first = channels[0]
