@@ -24,9 +24,9 @@ WHEEL_KG, BALL_KG = 2.0, 0.2
 # at the most: beyond that a contact's friction lags behind the wheel.
 SERVO_NMSPR = {"skid": 20.0, "car": 400.0, "omni": 0.3}
 LEAST_INERTIA_KGM2 = {"skid": 0.05, "car": 0.5, "omni": 0.002}  #: of a motor, at the wheel
-# Times in which contacts yield normal to the ground and along it.  Along it they are soft: a contact that slides and is
-# stiff lifts itself off the ground, as a convex solver has it.
-NORMAL_S, CREEP_S = 0.02, 0.9
+# Times in which contacts yield normal to the ground and along it.  Wheels that slide all the time are softer along it:
+# a contact that slides and is stiff lifts itself off the ground, as a convex solver has it.
+NORMAL_S, CREEP_S = 0.02, {"skid": 0.5, "car": 0.25, "omni": 0.04}
 MOTORS = "actuatorvel", "actuatorfrc"  #: sensors of each motor
 
 
@@ -139,7 +139,7 @@ def model_of(kind: str, body: Body, scene: Scene, motor: Motor) -> Any:
     mu, drag_m = body.friction_ratio, body.drag_ratio * w
     pairs = "".join(
         f'<pair geom1="ground" geom2="tyre{k}" condim="6" friction="{mu} {mu} 0.001 {drag_m} {drag_m}" '
-        f'solref="{NORMAL_S} 1" solreffriction="{CREEP_S} 1"/>'
+        f'solref="{NORMAL_S} 1" solreffriction="{CREEP_S[kind]} 1"/>'
         for k in wheels
     )
     xml = f"""
