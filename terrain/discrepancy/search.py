@@ -174,10 +174,6 @@ SHARED = 0.5
 """Least correlation of what a cause and its rival change: one that shares less with it explains something
 else, and is no rival, however little worse it fits."""
 
-LOST_RATIO = 0.2
-"""Part of what a cause gains in its clearest channel that a rival may lose there: what cannot change a gyro, by itself
-or by what the other causes take over, is no rival of its scale however noisy other channels are."""
-
 PLAUSIBLE_STDS = 2.36
 """Standard deviations by which a rival may be beyond its plausible range: the half of a 95 % interval."""
 
@@ -218,7 +214,6 @@ def rivals_of(
             behind = min(fits[0][0] - own[0][0], fits[1][0] - own[1][0]) / inflation
             here, square = fits[0][1], float(own[0][1].c[0])
             worse = float(here.c[0]) > (1.0 + RIVAL_RISE) * square + RIVAL_LOSS * inflation
-            worse = worse or not _acts_there(problem, info, names_of(others), own[0][1], here)
             if not worse and behind < (TWIN_LOSS if alike > TWIN else RIVAL_LOSS):
                 its = [p.name for p in effect.parameters]
                 at, places = [INDEX[name] for name in its], here.places(its)
@@ -233,18 +228,6 @@ def rivals_of(
         as_good.sort(key=lambda rival: rival[0])
         rivals[cause.name] = {name: rival for _, name, rival in as_good}
     return rivals
-
-
-def _acts_there(
-    problem: Problem, info: Evidence, others: Sequence[str], cause: Evidence, rival: Evidence
-) -> bool:
-    """Return whether a rival gains in the clearest channel of a cause what that does, beside other parameters."""
-    point = move_point(info.vector, others, info.fit(others)[0] if others else ())
-    fits = problem.near(info, point, ()), cause, rival
-    without, with_cause, with_rival = [sum((w[-1] ** 2).sum(axis=0) for w in each.white) for each in fits]
-    gained = without - with_cause
-    main = int(np.argmax(gained))
-    return bool(with_rival[main] - with_cause[main] <= max(RIVAL_LOSS, LOST_RATIO * gained[main]))
 
 
 def _near(

@@ -157,8 +157,6 @@ def test_what_changes_other_channels_is_no_rival(posed, solve, monkeypatch):
     # as if the yaw had been withdrawn
     assert rivals_of(problem, fit.info, start, [payload]) == {"payload": {}}
     monkeypatch.setattr(search_module, "SHARED", -1.0)
-    assert rivals_of(problem, fit.info, start, [payload]) == {"payload": {}}
-    monkeypatch.setattr(search_module, "_acts_there", lambda *_: True)
     rivals = rivals_of(problem, fit.info, start, [payload])["payload"]
     assert "camera_yaw" in rivals
 
@@ -229,23 +227,10 @@ def test_an_effect_that_is_little_behind_is_a_rival(monkeypatch, behind, square,
     monkeypatch.setattr(search_module, "replace", lambda *_, **__: None)
     monkeypatch.setattr(search_module, "fit_again", fit)
     monkeypatch.setattr(search_module, "_near", lambda *_: [(other, alike)])
-    monkeypatch.setattr(search_module, "_acts_there", lambda *_: True)
     monkeypatch.setattr(search_module, "wald_test", lambda *_: SimpleNamespace(inflation=inflation))
     rivals = rivals_of(None, info, start, [cause])[cause.name]
     assert list(rivals) == [other.name] * is_rival
     assert all((change[0], std[0]) == pytest.approx((0.1, 0.01)) for change, std, _ in rivals.values())
-
-
-@pytest.mark.parametrize(("lost", "acts"), [(7.0, True), (19.0, True), (21.0, False)])
-def test_a_rival_acts_where_the_cause_shows(lost, acts):
-    """What it gains in another channel is no amends: the cause gains 100 in the first one."""
-    without, cause, rival = (
-        SimpleNamespace(white=[np.sqrt([[[square, other]]])])
-        for square, other in ((150.0, 50.0), (50.0, 40.0), (50.0 + lost, 0.0))
-    )
-    problem = SimpleNamespace(near=lambda *_: without)
-    info = SimpleNamespace(vector=np.zeros(len(INDEX)))
-    assert search_module._acts_there(problem, info, (), cause, rival) == acts
 
 
 @pytest.mark.parametrize(
