@@ -160,6 +160,8 @@ POSITION, VELOCITY = GNSS_CHANNELS[:2], GNSS_CHANNELS[2:4]  #: Of a receiver.
 MOVING_MPS = 0.4
 #: A wheel turns backward if it is faster than that on at least so many samples.
 BACKWARD_MPS, MIN_BACKWARD = 0.02, 5
+#: Part of the described friction, which is often assumed, that a wheel that drives takes at the least.
+LEAST_FRICTION = 0.5
 #: A run whose currents are not known in more than that ratio of its samples counts as one without.
 MOSTLY_BRAKED = 0.5
 #: Least norm of the mean of the wheels' unit vectors at which the sum of currents measures traction: wheels within 18
@@ -344,7 +346,7 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
                 if (speed < -BACKWARD_MPS).sum() >= MIN_BACKWARD and not np.nanmin(current) < 0:
                     current *= np.sign(speed)
             if unsigned and robot.skids:  # a wheel that turns with less than its friction takes is braked
-                least_a = robot.motors.friction_nm / robot.motors.nm_per_a
+                least_a = LEAST_FRICTION * robot.motors.friction_nm / robot.motors.nm_per_a
                 braked = (np.abs(speeds) > BACKWARD_MPS) & (np.abs(currents) < least_a)
                 mostly = braked.any(axis=1).mean() > MOSTLY_BRAKED
                 currents[braked if not mostly else slice(None)] = np.nan
