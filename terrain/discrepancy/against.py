@@ -307,6 +307,11 @@ def _test(sets: _Sets, causes: Sequence[str], chosen: Sequence[Effect], effect: 
             fits.append(float(there @ parts[k][:m, :m] @ there - 2.0 * there @ scores[k][:m]))
         gains.append(fits[0] - fits[1])
     std = np.sqrt(np.maximum(np.diag(cov), 0.0) * dispersion)
+    # in neither set is it of a size that no builder would believe
+    for p, more in zip(effect.parameters, change.tolist(), strict=True):
+        first = float(sets.info.vector[INDEX[p.name]] + x[common.index(p.name)])
+        if not all(p.plausible[0] <= value <= p.plausible[1] for value in (first, first + more)):
+            return nothing
     return _Test(z, change, std, dof, float(np.sum(gains)), dispersion)
 
 

@@ -38,7 +38,7 @@ def sets(hide):
         ("wheel_radius_ratio", -0.05),
         ("payload_ratio", 0.3),
         ("effective_track_ratio", 0.6),
-        ("gyro_scale_ratio", 0.05),
+        ("gyro_scale_ratio", 0.03),
     ],
 )
 def test_what_changed_is_named_with_its_size_beside_what_both_have(sets, name, value):
