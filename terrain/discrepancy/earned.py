@@ -45,7 +45,10 @@ ACTS = 0.5
 SHARE = 0.25
 """It is stated beside a channel of which it makes at least that part of the change by all causes, root mean square."""
 
-WORSE = 0.02  #: Part of the square of a channel by which a cause makes it worse
+WORSE, OUTWEIGHS = 0.02, 10.0
+"""Part of the square of a channel by which a cause makes it worse, and how many times that, over the noise, it has to
+remove from the others all the same: a channel that is wrong by itself, as currents of a turning resistance that is not
+known, hardly speaks against a track that takes the error of three others."""
 
 
 def units_of(runs: Sequence[RunLog] | Sequence[Signals]) -> list[str]:
@@ -255,6 +258,7 @@ def judge(fit: CauseFit, built: Sequence[Effect], on: HeldOut) -> Judgement:
         ratio, interval = removed[cause.name] = part.gain(weights * acts, on.seed)
         own_gain, learner, _ = gains_of(squares @ (weights * acts), True, on.seed)
         words = " and ".join([CHANNEL_WORDS[name][0] for name in main])
+        net = float(((part.squares[:, 1] - part.squares[:, 2]).sum(axis=0) * weights).sum())
         if not earns(ratio, interval, -math.inf, on.shown):
             reasons[cause.name] = f"{_percent(ratio, interval)} of the square of {words} go with it"
         elif not earns(*own_gain, learner[0], on.shown):
@@ -262,7 +266,10 @@ def judge(fit: CauseFit, built: Sequence[Effect], on: HeldOut) -> Judgement:
             reasons[cause.name] = f"{_percent(*own_gain)} of the square of {words} go, {beside}"
         for name in gain.channels:
             more, ends = part.gain(np.array([channel == name for channel in CHANNELS], dtype=float), on.seed)
-            if more < -WORSE and ends[1] < 0.0:
+            c = CHANNELS.index(name)
+            added = -more * part.squares[:, 0, c].sum() * weights[c]
+            outweighed = net + added > OUTWEIGHS * added
+            if more < -WORSE and ends[1] < 0.0 and not outweighed:
                 worse = f"{CHANNEL_WORDS[name][0]} worse, by {-100 * more:.0f} % of its square"
                 reasons.setdefault(cause.name, f"it makes {worse}")
     reasons = {name: f"on {on.how}: {why}" for name, why in reasons.items()}
