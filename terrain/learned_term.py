@@ -335,6 +335,8 @@ SIDES = {
 }
 """By input: where it is positive, negative and either, and its unit."""
 
+INPUT_WORDS = dict(zip(INPUTS, ("speed", "sideways speed", "turn rate", "grade", "roll"), strict=True))
+
 AMOUNTS = {
     SPEED_X: ("speed gained", "speed lost", "speed gained or lost", "speed_mps"),
     HEADING: ("yaw rate gained", "yaw rate lost", "yaw rate gained or lost", "turn_radps"),
@@ -388,7 +390,9 @@ def where_it_acts(channel: str, products: Sequence[str], added: Array, inputs: A
     changing = [name for name in products if "change(" in name]
     if len(changing) == len(products):
         places.append("while that changes" if places else "while speeds change")
-    return f"{what} {', '.join(places) or 'throughout'}"
+    by = [INPUT_WORDS[name] for name in inputs_used(products)]
+    everywhere = f"by {' and '.join(by)}" if what == either and by else "throughout"
+    return f"{what} {', '.join(places) or everywhere}"
 
 
 # -- The section of a description ------------------------------------------------------------------------------

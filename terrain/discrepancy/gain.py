@@ -53,7 +53,11 @@ def ratio_of_sums(part: Array, whole: Array, seed: int) -> tuple[float, Interval
     counts = stratified_counts(np.zeros(n), N_BOOTSTRAP, np.random.default_rng(seed))
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = (counts @ part) / (counts @ whole)
-    return float(part.sum() / whole.sum()), percentile_interval(ratios, freedom=n - 1)
+    low, high = percentile_interval(ratios, freedom=n - 1)
+    return float(part.sum() / whole.sum()), (
+        min(low, 1.0),
+        min(high, 1.0),
+    )  # of a square no more is removed than all
 
 
 def earns(reduction: float, ci: Interval, learner_reduction: float, shown: bool) -> bool:
@@ -152,8 +156,8 @@ def squares_of(runs: Sequence[ComparedRun], learned: Sequence[Array]) -> tuple[A
 def gains_of(square: Array, extended: bool, seed: int) -> tuple[tuple[float, Interval], ...]:
     """Return what the extension, the learner, and the learner beyond the extension remove of squares (clusters, 3)."""
     before, learner, after = square.T
-    own = ratio_of_sums(before - after, before, seed) if extended else NONE
-    return own, ratio_of_sums(before - learner, before, seed), ratio_of_sums(after - learner, before, seed)
+    own = part_removed(before - after, before, seed) if extended else NONE
+    return own, part_removed(before - learner, before, seed), part_removed(after - learner, before, seed)
 
 
 class Removed(NamedTuple):
@@ -167,7 +171,7 @@ class Removed(NamedTuple):
     def gain(self, weights: Array, seed: int) -> tuple[float, Interval]:
         """Return the part of the square before that it removes, of channels by their weights (channels,)."""
         before, rest, beside = (self.squares @ weights).T
-        return ratio_of_sums(rest - beside, before, seed)
+        return part_removed(rest - beside, before, seed)
 
 
 def removed_by(runs: Sequence[ComparedRun], others: Sequence[ComparedRun], weights: Array) -> Removed:

@@ -103,7 +103,7 @@ def test_the_first_screen_answers_what_why_how_certain_what_for_and_what_next(ex
 def test_a_channel_that_nothing_explains_leads_where_nothing_is_explained(explained):
     open_ = AHEAD._replace(tier=verdict.Tier.UNEXPLAINED, causes=(), gain=np.nan, rms_after=np.nan)
     result = explained(channels=(open_,), candidates=(LEVER_ARM._replace(tier=verdict.Tier.CANDIDATE),))
-    assert "no cause could be named for it: a learner without names removes 76" in result.report.answer
+    assert "no cause could be named for it; a learner without names removes 76" in result.report.answer
     assert "not built in: lever arm" in text_of(result)
     two = explained(a_gain(), channels=(open_._replace(channel="current_a"), AHEAD), causes=(LEVER_ARM,))
     assert two.report.answer.startswith("The simulated speed ahead")
