@@ -191,9 +191,9 @@ def answer_of(result: ExplainResult) -> str:
     causes = [cause for cause in result.diagnosis.built_in if cause.name in first.causes]
     if not causes or not first.gain > 0.0:
         says = [term.says for term in result.diagnosed.with_terms.learned if term.channel == first.channel]
-        learned = f"; learned instead: {enumerated(says)}" if says else ""
+        instead = f"; learned instead: {enumerated(says)}" if says else ""
         learner = f"a learner without names removes {percent_text(first.learner_gain)} of its square"
-        return f"{_capital(what)}, and no cause could be named for it{learned}; {learner}."
+        return f"{_capital(what)}, and no cause could be named for it{instead}; {learner}."
     terms = enumerated([_terms(cause, result) for cause in causes[:STATED]])
     one_of = " (or what looks the same)" if any(cause.tier is Tier.SET for cause in causes) else ""
     how = result.gain.gain.how

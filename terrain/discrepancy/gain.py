@@ -53,11 +53,13 @@ def ratio_of_sums(part: Array, whole: Array, seed: int) -> tuple[float, Interval
     counts = stratified_counts(np.zeros(n), N_BOOTSTRAP, np.random.default_rng(seed))
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = (counts @ part) / (counts @ whole)
-    low, high = percentile_interval(ratios, freedom=n - 1)
-    return float(part.sum() / whole.sum()), (
-        min(low, 1.0),
-        min(high, 1.0),
-    )  # of a square no more is removed than all
+    return float(part.sum() / whole.sum()), percentile_interval(ratios, freedom=n - 1)
+
+
+def part_removed(removed: Array, square: Array, seed: int) -> tuple[float, Interval]:
+    """Return which part of a square (clusters,) is removed, and its 95 % interval: of none more than all."""
+    part, (low, high) = ratio_of_sums(removed, square, seed)
+    return part, (min(low, 1.0), min(high, 1.0))
 
 
 def earns(reduction: float, ci: Interval, learner_reduction: float, shown: bool) -> bool:

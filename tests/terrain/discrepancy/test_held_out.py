@@ -125,7 +125,8 @@ def test_a_fault_is_repaired_in_the_held_out_runs_that_have_it():
 
 def test_the_covariance_of_what_is_found_again_replaces_the_known_one():
     found = {"lever_x_m": 0.1, "lever_y_m": -0.05}
-    again = SimpleNamespace(values=found, covariance=([*found], np.array([[4.0, 1.0], [1.0, 9.0]]) * 1e-6))
+    covariance = [*found], np.array([[4.0, 1.0], [1.0, 9.0]]) * 1e-6
+    again = SimpleNamespace(values=found, covariance=covariance, latest=())
     known = {"lever_x_m": 0.2, "payload_ratio": 0.1}
     robot = replace(HUSKY, effects=known, effects_cov=np.array([[1.0, 0.5], [0.5, 16.0]]) * 1e-4)
     values, cov, intervals = extended_effects(robot, again)
