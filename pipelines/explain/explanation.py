@@ -190,8 +190,8 @@ def answer_of(result: ExplainResult) -> str:
     what = _off(result, first)
     causes = [cause for cause in result.diagnosis.built_in if cause.name in first.causes]
     if not causes or not first.gain > 0.0:
-        says = [term.says for term in result.diagnosed.with_terms.learned if term.channel == first.channel]
-        instead = f"; learned instead: {enumerated(says)}" if says else ""
+        terms_of = [term.says for term in result.diagnosed.with_terms.learned if term.channel == first.channel]
+        instead = f"; learned instead: {enumerated(terms_of)}" if terms_of else ""
         learner = f"a learner without names removes {percent_text(first.learner_gain)} of its square"
         return f"{_capital(what)}, and no cause could be named for it{instead}; {learner}."
     terms = enumerated([_terms(cause, result) for cause in causes[:STATED]])
