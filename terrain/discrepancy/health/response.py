@@ -141,6 +141,11 @@ def odd_runs(runs: Sequence[Rows], follows: Agreement, among: Sequence[int]) -> 
         for c, name in ODD_CHANNELS.items():
             gain, fit = follows.gain[:, c], follows.correlation[:, c]
             places = [i for i in of_terrain if gain[i] > 0 and fit[i] > FOLLOWS]
+            turned = [i for i in of_terrain if gain[i] < 0 and fit[i] < -FOLLOWS]
+            for i in turned if len(turned) <= MAX_ODD_RATIO * len(places) else ():
+                reasons.setdefault(
+                    i, f"{UNLIKE} runs: its {name} is opposite to what they make of the same wheels"
+                )
             if len(places) < MIN_COMPARED:
                 continue
             seconds = [np.isfinite(runs[i].measured[:, c]).sum() * min(runs[i].period_s, 1.0) for i in places]
