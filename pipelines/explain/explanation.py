@@ -158,6 +158,7 @@ def report(result: ExplainResult) -> Report:
 BY_SENSOR = {GYRO: "gyro", HEADING: "heading"}  #: That measure the same motion
 
 STATED = 3  #: Channels, causes or candidates that an answer lists
+LEARNED = 2  #: Learned terms that it lists
 NAMELESS = (Tier.CANDIDATE, Tier.UNEXPLAINED)
 
 
@@ -190,7 +191,9 @@ def answer_of(result: ExplainResult) -> str:
     what = _off(result, first)
     causes = [cause for cause in result.diagnosis.built_in if cause.name in first.causes]
     if not causes or not first.gain > 0.0:
-        terms_of = [term.says for term in result.diagnosed.with_terms.learned if term.channel == first.channel]
+        terms_of = [
+            term.says for term in result.diagnosed.with_terms.learned if term.channel == first.channel
+        ]
         instead = f"; learned instead: {enumerated(terms_of)}" if terms_of else ""
         learner = f"a learner without names removes {percent_text(first.learner_gain)} of its square"
         return f"{_capital(what)}, and no cause could be named for it{instead}; {learner}."
@@ -248,15 +251,15 @@ def _why(result: ExplainResult) -> str:
         as_one = f" (built in as {_terms(built[0], result)})" if built else ""
         parts.append(f"one of {members}{as_one}")
     parts += [varying_text(effect).removesuffix(".") for effect in diagnosis.varying]
-    learned = [
-        f"{term.says} ({CHANNEL_WORDS[term.channel][0]})" for term in result.diagnosed.with_terms.learned
-    ]
-    if learned:
-        parts.append(f"learned, since no name fits: {enumerated(learned)}")
+    if terms := result.diagnosed.with_terms.learned:
+        more = [f"{n} more below"] if (n := len(terms) - LEARNED) > 0 else []
+        parts.append(
+            f"learned, since no name fits: {enumerated([*[t.says for t in terms[:LEARNED]], *more])}"
+        )
     nameless = [CHANNEL_WORDS[of.channel][0] for of in channels_that_matter(result) if of.tier in NAMELESS]
     if nameless:
         parts.append(f"no cause is named for {enumerated(nameless)}")
-    return "; ".join(parts) or "nothing is to be explained"
+    return _capital("; ".join(parts)) or "Nothing is to be explained"
 
 
 def _how_certain(result: ExplainResult) -> str:
@@ -292,7 +295,7 @@ def next_text(result: ExplainResult) -> str:
             f"drive next_drive.csv ({coming.duration_s:.0f} s of speeds and yaw rates, {where}, on a field of "
             f"{coming.length_m:.0f} by {coming.width_m:.0f} m): {coming.reason}"
         )
-    return "; ".join(steps) or "nothing is open that a drive of this robot would show"
+    return _capital("; ".join(steps)) or "Nothing is open that a drive of this robot would show"
 
 
 def _off(result: ExplainResult, of: ChannelVerdict) -> str:
@@ -304,7 +307,7 @@ def _off(result: ExplainResult, of: ChannelVerdict) -> str:
                 text = off_by(of.channel, ratio, level)
                 if of.channel in BY_SENSOR:
                     return f"{text}, by the {BY_SENSOR[of.channel]}"
-                return text if "simulation" in text else f"{CHANNEL_WORDS[of.channel][0]}: {text}"
+                return text.replace("simulated, it is", f"the simulated {CHANNEL_WORDS[of.channel][0]} is")
     name, unit = CHANNEL_WORDS[of.channel]
     return f"the simulated {name} is off by {of.rms_before:.2g} {unit} rms"
 

@@ -27,7 +27,7 @@ from terrain.records import Array
 
 BAND_STDS = 2.0  #: Half width of the noise band in standard deviations
 
-MEASURED, BEFORE, AFTER = "measured", "simulated", "with the causes built in"
+MEASURED, BEFORE, AFTER = "measured", "simulated", "extended"
 BLUE, VERMILION, GREY = 0, 1, 6
 AXIS = "{} [{}]"  #: Of what a channel is called, and its unit
 LEAST_POWER = 1e-300  #: Under the logarithm of a spectrum

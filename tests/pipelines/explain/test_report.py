@@ -86,18 +86,18 @@ def test_the_first_screen_answers_what_why_how_certain_what_for_and_what_next(ex
     text = text_of(result)
     for stated in (
         "What is wrong The simulated speed ahead is off by 0.02 m/s rms",
-        "Why the measured point 0.45 m ahead and 0.05 m right of the centre",
+        "Why The measured point 0.45 m ahead and 0.05 m right of the centre",
         "How certain 95 % intervals: lever arm 0.45 m (0.44 to 0.46) and -0.05 m (-0.06 to -0.04)",
         "What it gains On 2 runs held out: names remove 50 % (40 to 60 %) over all channels; a black-box learner "
         "removes 76 %",
-        "What next simulate and estimate with extended.yaml in place of the robot's file",
+        "What next Simulate and estimate with extended.yaml in place of the robot's file",
         "lever arm 0.1 m 90 mm to 0.11 m 40.0 % 9.0",
         "No log distinguishes lever arm from an alias.",
     ):
         assert stated in text
     nothing = explained().report
     assert nothing.answer == "These runs show nothing that the simulation of a<b> gets wrong."
-    assert "What next nothing is open that a drive of this robot would show" in text_of(explained())
+    assert "What next Nothing is open that a drive of this robot would show" in text_of(explained())
 
 
 def test_a_channel_that_nothing_explains_leads_where_nothing_is_explained(explained):
@@ -155,7 +155,7 @@ LEFT = (
         (
             {"ambiguous_sets": (tuple(RIVALS),), "ambiguous_values": RIVALS, "of_sets": (OF_SET,)},
             (
-                "Why one of payload or motor constant (built in as",
+                "Why One of payload or motor constant (built in as",
                 "20 % (10 to 30 %) accelerations and slopes; speed ahead distinguishes it from motor constant",
             ),
         ),
@@ -182,7 +182,7 @@ LEFT = (
                 f"r3 0.0123 0.0010 r4 {NOT_KNOWN}",
                 "excluded as unfit: r<9>.",
                 "r<9> its gyro stands still",
-                "drive next_drive.csv (62 s of speeds and yaw rates, on a slope of 6°, up which it starts, on a field "
+                "Drive next_drive.csv (62 s of speeds and yaw rates, on a slope of 6°, up which it starts, on a field "
                 "of 10 by 4 m): it parts them",
             ),
         ),
@@ -216,7 +216,7 @@ def test_figures_show_the_residual_before_and_after_with_the_noise_about_the_mea
         assert np.nanstd(second.y) < 0.5 * np.nanstd(first.y)
     spectra = spectra_figure(runs, noise, 2.5)
     levels = {each.label: np.median(each.y) for each in spectra.panels[place].marks}
-    assert levels["noise"] == pytest.approx(levels["with the causes built in"], abs=5.0)
+    assert levels["noise"] == pytest.approx(levels["extended"], abs=5.0)
     band, points = parts_figure(few.diagnosed.parts).panels[0].marks
     (value,) = few.diagnosis.causes[0].parameters
     assert (band.low[0], band.high[0]) == (value.low, value.high)
