@@ -25,6 +25,9 @@ def against_text(against: Against, name: str) -> str:
     text = f"From these runs to {name} nothing changed that they show."
     if sentences:
         text = f"From these runs to {name} changed: {enumerated(sentences)}."
+    if against.candidates:
+        names = enumerated([effect_label(each.name) for each in against.candidates])
+        text += f" Without a gain on held-out runs that can be claimed, not stated: {names}."
     if against.unnamed:
         channels = enumerated([CHANNEL_WORDS[each.channel][0] for each in against.unnamed])
         text += f" Without a known cause the two{' also' if sentences else ''} differ in {channels}."

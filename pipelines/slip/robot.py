@@ -45,7 +45,7 @@ def calibrate(settings: Settings, progress: Progress) -> CalibrationResult:
     LogError
         if a run cannot be read.
     ConfigError
-        if the robot's description is not accepted, lacks a section or has effects, or ``out`` is there
+        if the robot's description is not accepted, lacks a section or has effects or learned terms, or ``out`` is there
         already or is no YAML file.
     DataError
         if a run is another robot's, the runs show nothing, or those of a skid-steer robot have no lidar.
@@ -54,9 +54,10 @@ def calibrate(settings: Settings, progress: Progress) -> CalibrationResult:
     path = description_file(settings.robot)
     file, description = path.name, read_yaml(path)
     robot = robot_from(file, description)
-    if robot.effects:  # what is calibrated would hold them a second time
+    if robot.effects or robot.learned:  # what is calibrated would hold them a second time
+        what = "effects" if robot.effects else "learned terms"
         raise ConfigError(
-            f"robot {robot.name}: {file} is extended by effects; calibrate the description without them, "
+            f"robot {robot.name}: {file} is extended by {what}; calibrate the description without them, "
             "then explain again"
         )
     if (out := settings.out) is not None:

@@ -3,7 +3,8 @@
 Both sets are fitted together.  Each effect has a value that both share, and its difference, which acts in the second
 set alone, is a candidate: one column of the evidence more, zero in the runs of the first set.  Differences are added
 while one is significant and gains on runs left out of the fit, as causes are in :mod:`terrain.discrepancy.search`;
-clusters are runs, or sessions where each set has several.  What both sets have in common, known or not, is in neither
+clusters are runs, or sessions where each set has several.  One whose gain beside the others, on runs held out, has an
+interval that holds 0 is a candidate.  What both sets have in common, known or not, is in neither
 column and cancels.
 """
 
@@ -70,6 +71,7 @@ class Against(NamedTuple):
     """What changed between two sets of runs, and what predicting it gains on runs of both that were held out."""
 
     differences: tuple[Difference, ...]
+    candidates: tuple[Difference, ...]  #: significant, but without a gain on runs held out
     unnamed: tuple[
         Unexplained, ...
     ]  #: channels that differ between the sets beside these, with an input each
@@ -77,7 +79,8 @@ class Against(NamedTuple):
     n_sessions: tuple[int, int]  #: 0 where runs name none
     clusters: str  #: ``runs`` or ``sessions``
     n_held_out: int
-    reduction: float  #: of the whitened square of held-out runs, over values in common; NaN without them
+    #: Of the whitened square of held-out runs that the differences take, over values in common; NaN without either.
+    reduction: float
     ci: tuple[float, float]
     excluded_runs: tuple[Excluded, ...]  #: of the second set
 
@@ -234,12 +237,24 @@ def compare_sets(
             break
         chosen = [effect for effect in more if effect not in weak]
         sets = fits[k] if not weak else refit(chosen)
-    differences = tuple([_difference(sets, causes, chosen, effect, library) for effect in chosen])
     reduction, ci, n_held = math.nan, (math.nan, math.nan), len(held_out[0]) + len(held_out[1])
+    candidates: tuple[Difference, ...] = ()
     if chosen and n_held:
-        reduction, ci = _gain(sets, start, problem, causes, chosen, held_out, seed)
+        about = {"problem": problem, "causes": causes, "held_out": held_out, "seed": seed}
+        earned = []
+        for effect in chosen:
+            others = [other for other in chosen if other is not effect]
+            own, (low, _) = _gain(sets, refit(others), chosen, others, **about)
+            if (low if n_held >= MIN_RUNS else own) > 0.0:  # of two runs Student's t reaches 13 deviations
+                earned.append(effect)
+        weak = [effect for effect in chosen if effect not in earned]
+        candidates = tuple([_difference(sets, causes, chosen, effect, library) for effect in weak])
+        sets, chosen = refit(earned) if weak else sets, earned
+        if chosen:
+            reduction, ci = _gain(sets, start, chosen, (), **about)
     return Against(
-        differences,
+        tuple([_difference(sets, causes, chosen, effect, library) for effect in chosen]),
+        candidates,
         _unnamed(sets, causes, chosen),
         (len(first), len(second)),
         (n_sessions[0], n_sessions[1]),
@@ -386,18 +401,22 @@ def _unnamed(sets: _Sets, causes: Sequence[str], chosen: Sequence[Effect]) -> tu
 def _gain(
     sets: _Sets,
     start: _Sets,
+    chosen: Sequence[Effect],
+    others: Sequence[Effect],
     problem: Problem,
     causes: Sequence[str],
-    chosen: Sequence[Effect],
     held_out: tuple[Sequence[Signals], Sequence[Signals]],
     seed: int,
 ) -> tuple[float, tuple[float, float]]:
-    """Return by how much the square of held-out runs falls where each set has its own values, and its interval."""
+    """Return by how much the square of held-out runs falls where each set has its own values, and its interval.
+
+    It falls from that of the fit ``start``, in which those of ``others`` alone differ.
+    """
     common, differ = _names(causes, chosen)
     second = np.repeat([0.0, 1.0], [len(runs) for runs in held_out])
     judged = problem._replace(signals=(*held_out[0], *held_out[1]))
     costs = []
-    for of, names in ((start, ()), (sets, differ)):
+    for of, names in ((start, names_of(others)), (sets, differ)):
         own: Mapping[str, Array] = _own_values(of, common, names, second)
         info = judged.at(sets.info.vector, noise=sets.info.noise, scatter=sets.info.scatter, own=own)
         there = np.column_stack([values - sets.info.vector[INDEX[name]] for name, values in own.items()])

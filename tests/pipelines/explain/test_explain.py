@@ -14,8 +14,10 @@ from pipelines.report.terminal import terminal_text
 from pipelines.slip import calibrate
 from pipelines.slip.estimate import estimate_runs
 from terrain.discrepancy.verdict import INTERVAL_T
+from terrain.effects import SPEED_X
 from terrain.errors import ConfigError, TerrainError
 from terrain.extension import extended_yaml
+from terrain.learned_term import LearnedTerm
 from terrain.logs.run_folders import write_run
 from terrain.robots import description_file, load_robot
 from terrain.simulation.plants.planar import DRIVE_S, Ground, spread_numbers
@@ -164,4 +166,10 @@ def test_an_extended_description_passes_through_the_commands(tmp_path):
     assert LivePilot(robot).control._radius_m == pytest.approx(0.208)
     with pytest.raises(ConfigError, match="is extended by effects"):
         calibrate.run(calibrate.Settings(data=tmp_path, robot=str(out)), silent)
+    term = LearnedTerm(SPEED_X, ("speed_mps",), np.array([0.1]), np.eye(1), {"speed_mps": (0.0, 1.0)}, 0.01)
+    out.with_name("learned.yaml").write_text(
+        extended_yaml("agrimaro", {}, np.zeros((0, 0)), {}, "", learned=[term])
+    )
+    with pytest.raises(ConfigError, match="is extended by learned terms"):
+        calibrate.run(calibrate.Settings(data=tmp_path, robot=str(out.with_name("learned.yaml"))), silent)
     assert yaml.safe_load(out.read_text())["effects"]["schema"] == 1

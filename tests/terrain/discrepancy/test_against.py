@@ -63,6 +63,17 @@ def test_sets_that_are_alike_differ_in_nothing_though_the_simulation_is_wrong_in
         assert "nothing changed" in against_text(against, "b")
 
 
+def test_a_difference_that_held_out_runs_do_not_have_is_a_candidate(sets):
+    first, second = sets({}, {"wheel_radius_ratio": -0.05})
+    for changed in (0.0, -0.05):
+        held_out = sets({}, {"wheel_radius_ratio": changed}, seed=7)
+        against = compare_sets(first, second, simulation_of(HUSKY), (), LIBRARY, held_out)
+        named, not_earned = ([each.name for each in of] for of in (against.differences, against.candidates))
+        assert (named, not_earned) == ((["wheel_radius"], []) if changed else ([], ["wheel_radius"]))
+        assert ("not stated: wheel radius" in against_text(against, "b")) == (not changed)
+        assert (against.reduction > 0.0) == bool(changed)
+
+
 def test_a_change_without_a_name_is_left_to_a_channel(sets):
     first, second = sets({}, {"gyro_scale_ratio": 0.08})
     against = compare_sets(first, second, simulation_of(HUSKY), (), [effect_named("payload")])
