@@ -184,7 +184,7 @@ def whole_rows(name: str, label: str, found: DiagnosedRuns) -> list[WholeRow]:
     about = last, found.low_pass, found.noise, found.diagnosis.covariance, found.learned
     nothing = [np.full_like(run.residual(True), 0.0) for run in beside]
     noise = {channel: of.noise for channel, of in found.diagnosis.residual_before.items()}
-    of_all = gain_of(beside, nothing, noise, 0, gain.how)
+    of_all = gain_of(beside, nothing, noise, 0, gain.how) if beside else None
     apart, std = (
         np.concatenate([np.empty((0, len(CHANNELS))), *parts])
         for parts in (
@@ -200,11 +200,12 @@ def whole_rows(name: str, label: str, found: DiagnosedRuns) -> list[WholeRow]:
         inside = np.abs(apart[known, c]) <= INTERVAL_T * std[known, c]
         covered = float(inside.mean()) if known.any() else np.nan
         before = named.channels[channel].reduction if named and channel in named.channels else np.nan
-        both = of_all.channels[channel].reduction if channel in of_all.channels else np.nan
+        both = of_all.channels[channel].reduction if of_all and channel in of_all.channels else np.nan
         gains = before, both, of.reduction, of.ci, of.learner_reduction
         rows.append(WholeRow(name, label, channel, *gains, covered, says.get(channel, "")))
     before = named.reduction if named else np.nan
-    gains = before, of_all.reduction, gain.reduction, gain.ci, gain.learner_reduction
+    both = of_all.reduction if of_all else np.nan
+    gains = before, both, gain.reduction, gain.ci, gain.learner_reduction
     return [*rows, WholeRow(name, label, ALL, *gains, np.nan, "")]
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from studies.real_sets import whole_rows
 
 from pipelines.explain.figures import dependence_figures, parts_figure, run_figure, spectra_figure
 from pipelines.report.numbers import NOT_KNOWN
@@ -221,3 +222,14 @@ def test_figures_show_the_residual_before_and_after_with_the_noise_about_the_mea
     (value,) = few.diagnosis.causes[0].parameters
     assert (band.low[0], band.high[0]) == (value.low, value.high)
     assert points.low[0] < value.value < points.high[0]
+
+
+def test_the_study_of_measured_sets_states_gains_and_coverage_of_runs_held_out_alone(few):
+    """The gain with all terms is that of the names where none is learned; without runs held out there is none."""
+    rows = whole_rows("a set", "none", few.diagnosed)
+    assert not few.diagnosed.learned or [row.channel for row in rows][-1] == "all"
+    for row in rows:
+        assert row.all_gain == pytest.approx(row.named_gain) or row.says
+        assert row.channel == "all" or row.coverage > 0.8
+    for row in whole_rows("a set", "none", replace(few.diagnosed, judged=())):
+        assert np.isnan([row.all_gain, row.coverage]).all()
