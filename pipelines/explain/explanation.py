@@ -19,7 +19,7 @@ from pipelines.explain.statements import (
     varying_text,
     would_have_shown,
 )
-from pipelines.report.numbers import enumerated, format_value, plural, sentence
+from pipelines.report.numbers import enumerated, format_value, sentence
 from pipelines.report.results import Result, as_json, described
 from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, Text
 from pipelines.report.versions import versions
@@ -130,8 +130,8 @@ class ExplainResult(Result, eq=False):
 def report(result: ExplainResult) -> Report:
     """Return what the simulation gets wrong and the gain, then the causes, then all that they rest on."""
     diagnosis, runs = result.diagnosis, result.diagnosed
-    held_out = f"{len(runs.held_out)} held out" if runs.held_out else ""
-    lead = f"{diagnosis.n_runs} runs compared", held_out, result.data, result.terrain
+    held_out = f"{len(runs.held_out)} more held out to check them" if runs.held_out else ""
+    lead = f"{diagnosis.n_runs} runs to find causes", held_out, result.data, result.terrain
     picture = None
     if shown := runs.whole or runs.compared:  # held-out runs where there are any
         stretch = example_stretch(shown, runs.noise)
@@ -155,7 +155,7 @@ def report(result: ExplainResult) -> Report:
 
 # -- The first screen: one sentence, and the five questions that a reader comes with ------------------------
 
-BY_SENSOR = {GYRO: "gyro", HEADING: "heading"}  #: That measure the same motion
+BY_SENSOR = {GYRO: "gyro", HEADING: "poses"}  #: That measure the same motion
 
 STATED = 3  #: Channels, causes or candidates that an answer lists
 LEARNED = 2  #: Learned terms that it lists
@@ -183,7 +183,7 @@ def answer_of(result: ExplainResult) -> str:
     if not channels and learned:
         says, removes = learned[0].says, percent_text(learned[0].reduction)
         of = f"the squared error of the {CHANNEL_WORDS[learned[0].channel][0]}"
-        return f"No name fits what these runs show of {robot}: {says}; a learned term of it removes {removes} of {of}."
+        return f"No known cause fits what {robot} does here: {says}; a learned term of it removes {removes} of {of}."
     if not channels:
         return f"These runs show nothing that the simulation of {robot} gets wrong."
     first = channels[0]
@@ -200,7 +200,7 @@ def answer_of(result: ExplainResult) -> str:
     terms = enumerated([_terms(cause, result) for cause in causes[:STATED]])
     one_of = " (or what looks the same)" if any(cause.tier is Tier.SET for cause in causes) else ""
     how = result.gain.gain.how
-    falls = f"the error of its {name} falls from {first.rms_before:.2g} to {first.rms_after:.2g} {unit}"
+    falls = f"the rms error of its {name} falls from {first.rms_before:.2g} to {first.rms_after:.2g} {unit}"
     return f"{_capital(what)}: with {terms}{one_of} {falls}, judged on {how}."
 
 
@@ -208,10 +208,10 @@ def five_questions(result: ExplainResult) -> Pairs:
     """Return what is wrong, why, how certain that is, what it gains, and what to do next."""
     diagnosis, channels = result.diagnosis, channels_that_matter(result)
     wrong = [_off(result, of) for of in channels[:STATED]]
-    if len(channels) > STATED:
-        wrong.append(f"{plural(len(channels) - STATED, 'more channel')} below")
+    if more := [CHANNEL_WORDS[of.channel][0] for of in channels[STATED:]]:
+        wrong.append(f"less in {enumerated(more)}")
     rows = [
-        ("What is wrong", _capital("; ".join(wrong)) or "Nothing that these runs show"),
+        ("What is wrong", _sentences(wrong) or "Nothing that these runs show."),
         ("Why", _why(result)),
         ("How certain", _how_certain(result)),
         ("What it gains", _gains(result)),
@@ -228,16 +228,18 @@ def _gains(result: ExplainResult) -> str:
         if first.gain > 0.0 and len(result.diagnosis.channels) > 1:
             interval = f"{percent_text(first.gain_ci[0], '')} to {percent_text(first.gain_ci[1])}"
             of = f"the squared error of the {CHANNEL_WORDS[first.channel][0]}"
-            parts.append(f"{percent_text(first.gain)} ({interval}) of {of}")
+            parts.append(f"it removes {percent_text(first.gain)} ({interval}) of {of}")
     if math.isfinite(names.reduction):
         refused = ", which may be nothing" if names.refused else ""
         interval = f"{percent_text(names.ci[0], '')} to {percent_text(names.ci[1])}"
-        parts.append(f"names remove {percent_text(names.reduction)} ({interval}) over all channels{refused}")
+        parts.append(
+            f"over all channels named causes remove {percent_text(names.reduction)} ({interval}){refused}"
+        )
     if whole.reduction > (names.reduction if math.isfinite(names.reduction) else 0.0):
         beside = "with the learned terms" if math.isfinite(names.reduction) else "learned terms remove"
         parts.append(f"{beside} {percent_text(whole.reduction)}")
     parts.append(f"a black-box learner removes {percent_text(names.learner_reduction)}")
-    return f"On {names.how}: {'; '.join(parts)}"
+    return f"On {names.how}: {'; '.join(parts)}."
 
 
 def _why(result: ExplainResult) -> str:
@@ -258,28 +260,25 @@ def _why(result: ExplainResult) -> str:
         )
     nameless = [CHANNEL_WORDS[of.channel][0] for of in channels_that_matter(result) if of.tier in NAMELESS]
     if nameless:
-        parts.append(f"no cause is named for {enumerated(nameless)}")
-    return _capital("; ".join(parts)) or "Nothing is to be explained"
+        parts.append(f"no known cause for {enumerated(nameless)}")
+    return _sentences(parts) or "Nothing is to be explained."
 
 
 def _how_certain(result: ExplainResult) -> str:
     """Return the intervals of what is built in, the candidates, and what these drives could not have shown."""
     diagnosis, parts = result.diagnosis, []
     for cause in diagnosis.built_in:
-        tier = "" if cause.tier is Tier.NAMED else ", one of a set"
+        tier = "confirmed on held-out runs" if cause.tier is Tier.NAMED else "one of a set that is confirmed"
         values = enumerated([value_in_robot_terms(*v[:2], *v[3:], result.robot) for v in cause.parameters])
-        parts.append(f"{effect_label(cause.name)} {values}{tier}")
-    if parts:
-        parts[0] = f"95 % intervals: {parts[0]}"
+        parts.append(f"{effect_label(cause.name)} {values}: {tier}")
     if diagnosis.candidates:
         shown = enumerated([effect_label(each.name) for each in diagnosis.candidates[:STATED]])
         more = f" and {n} more" if (n := len(diagnosis.candidates) - STATED) > 0 else ""
-        parts.append(f"candidates that did not earn a name and are not built in: {shown}{more}")
+        parts.append(f"not confirmed, and not built in: {shown}{more}")
     if n := len(diagnosis.not_shown):
-        parts.append(
-            f"{n} of {len(diagnosis.detection_limits)} parameters could not have been seen in these drives"
-        )
-    return "; ".join(parts) or "of all parameters, these drives would have shown any at a tenth of its range"
+        of = len(diagnosis.detection_limits)
+        parts.append(f"these drives cannot test {n} of {of} parameters, which may be wrong all the same")
+    return _sentences(parts) or "These drives would have shown any error of a tenth of its range."
 
 
 def next_text(result: ExplainResult) -> str:
@@ -288,14 +287,12 @@ def next_text(result: ExplainResult) -> str:
     if diagnosis.built_in:
         steps.append("simulate and estimate with extended.yaml in place of the robot's file")
     if coming := diagnosis.next_drive:
-        where = (
-            f"on a slope of {coming.grade_deg:g}°, up which it starts" if coming.grade_deg else "on the level"
-        )
+        where = f"facing up a slope of {coming.grade_deg:g}°" if coming.grade_deg else "on the level"
         steps.append(
             f"drive next_drive.csv ({coming.duration_s:.0f} s of speeds and yaw rates, {where}, on a field of "
             f"{coming.length_m:.0f} by {coming.width_m:.0f} m): {coming.reason}"
         )
-    return _capital("; ".join(steps)) or "Nothing is open that a drive of this robot would show"
+    return _sentences(steps) or "Nothing is open that a drive of this robot would show."
 
 
 def _off(result: ExplainResult, of: ChannelVerdict) -> str:
@@ -314,6 +311,10 @@ def _off(result: ExplainResult, of: ChannelVerdict) -> str:
 
 def _terms(cause: Cause, result: ExplainResult) -> str:
     return in_robot_terms(cause.name, cause.parameters, result.robot)
+
+
+def _sentences(parts: Sequence[str]) -> str:
+    return " ".join([f"{_capital(part).removesuffix('.')}." for part in parts])
 
 
 def _capital(text: str) -> str:
@@ -346,7 +347,7 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
         if cause.caveat and all(each.name != cause.name for each in diagnosis.varying):
             notes.append(f"{label}: {cause.caveat}.")
     if causes:
-        gain, terms = Column("removes of the square", PERCENT), Column("the robot has", long=True)
+        gain, terms = Column("squared error removed", PERCENT), Column("the robot has", long=True)
         heads = ("cause", "value", "95 %", gain, Column("z", Z), terms)
         yield Table(heads, causes, note=" ".join(notes))
     for names in diagnosis.ambiguous_sets:

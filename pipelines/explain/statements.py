@@ -32,6 +32,7 @@ AGREE = "measured and simulated agree"
 
 OF_TRACKS = {
     "wheel radius": "sprocket radius",
+    "Wheel radius": "Sprocket radius",
     "wheel": "track",
     "wheels": "tracks",
     "Wheel": "Track",

@@ -365,11 +365,11 @@ TIMES, MOST_TIMES = 1.5, 20.0
 CHANNEL_WORDS = {
     GYRO: ("yaw rate (gyro)", "rad/s"),
     SPEED_X: ("speed ahead", "m/s"),
-    SPEED_Y: ("speed to the left", "m/s"),
+    SPEED_Y: ("sideways speed", "m/s"),
     ACCEL: ("accelerometer ahead", "m/s²"),
-    CURRENT: ("sum of the currents", "A"),
-    TURNING_CURRENT: ("right minus left current", "A"),
-    HEADING: ("heading rate (no gyro)", "rad/s"),
+    CURRENT: ("sum of the motor currents", "A"),
+    TURNING_CURRENT: ("right minus left motor current", "A"),
+    HEADING: ("yaw rate from poses", "rad/s"),
 }
 #: Inputs of the simulation as axes call them.
 INPUT_LABELS = {
@@ -379,7 +379,7 @@ INPUT_LABELS = {
     "grade_rad": "grade [rad]",
     "roll_rad": "roll [rad]",
     "force_ratio": "force [weight]",
-    "sideways_mps": "speed to the left [m/s]",
+    "sideways_mps": "sideways speed [m/s]",
     "time_s": "time [s]",
 }
 #: What a simulation does with too much of it and too little, and with too low a level.

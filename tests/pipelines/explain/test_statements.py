@@ -146,7 +146,7 @@ RIVALS = {
         (
             runs_of(6, level=2.0, channel=CURRENT, std=0.1),
             {"unexplained": (Unexplained(CURRENT, "constant", 9.0, 0.9),)},
-            "sum of the currents: simulated, it is 2 A too small throughout.",
+            "sum of the motor currents: simulated, it is 2 A too small throughout.",
         ),
         (
             runs_of(6, channel=CURRENT),

@@ -73,7 +73,7 @@ def test_a_dependence_of_another_sign_in_each_run_is_none_of_all_runs(plain):
 
 
 def test_what_a_selected_parameter_explains_is_no_news(hide, pose):
-    """At the fit of a camera's yaw the speed to the left depends on nothing; where it is not fitted, on the speed."""
+    """At the fit of a camera's yaw the sideways speed depends on nothing; where it is not fitted, on the speed."""
     problem = pose(hide({"camera_yaw_rad": 0.05}), ("camera_yaw",))
     info = problem.at(problem.simulation.vector)
     before, after = probed(info), probe_residuals(info, ("camera_yaw_rad",), np.array([0.05]))
