@@ -181,7 +181,7 @@ def gain_text(gain: Gain) -> str:
     Examples
     --------
     >>> gain = Gain("8 runs held out", (), (), "runs", {}, 0.81, (0.74, 0.88), False, 0.83, (0.75, 0.91))
-    >>> gain_text(gain)
+    >>> gain_text(gain).replace(NBSP, " ")
     'Judged on 8 runs held out, the extension removes 81 % (74 to 88 %) of the square, a black-box learner 83 %.'
     """
     learner = f"a black-box learner {percent_text(gain.learner_reduction)}"

@@ -167,9 +167,9 @@ def accuracy_change(before: Array, after: Array, run_id: Array, seed: int) -> Ch
     --------
     >>> before, after = np.array([0, 0, 1, 1]), np.array([1, 1, 1, 1])
     >>> accuracy_change(before, after, np.array(["a", "a", "b", "b"]), 0)
-    Change(before=0.5, after=1.0, change_ci=(0.0, 1.0))
+    Change(before=0.5, after=1.0, change_ci=(-1.0, 1.0))
     """
     runs, of = np.unique(run_id, return_inverse=True)
     change = np.bincount(of, weights=after.astype(float) - before.astype(float), minlength=len(runs))
     interval = ratio_of_sums(change, np.bincount(of, minlength=len(runs)), seed)[1]
-    return Change(float(before.mean()), float(after.mean()), interval)
+    return Change(float(before.mean()), float(after.mean()), (max(interval[0], -1.0), min(interval[1], 1.0)))

@@ -52,7 +52,8 @@ def in_robot_terms(effect: str, values: Sequence[Value], robot: Robot) -> str:
     >>> in_robot_terms("clock_offset", [late], load_robot("husky"))
     'the wheels logged 0.27 s late'
     >>> narrow = Value("track_narrowing_s2pm2", 0.04, "s2pm2", 0.03, 0.05)
-    >>> in_robot_terms("track_narrowing", [narrow], load_robot("warthog"))
+    >>> by_turn = Value("track_narrowing_by_turn_ratio", 0.0, "ratio", -0.01, 0.01)
+    >>> in_robot_terms("track_narrowing", [narrow, by_turn], load_robot("warthog"))
     'a track that acts 6.9 % narrower at 2 m/s and 1 rad/s'
     """
     words, terms, plain = effect_named(effect).words, [], []
