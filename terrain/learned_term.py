@@ -65,18 +65,14 @@ INPUTS = ("speed_mps", "sideways_mps", "turn_radps", "grade_rad", "roll_rad")
 """Speeds ahead and to the left and yaw rate that the wheels would roll, and the tilt, uphill and left side up."""
 OF_WHEELS = INPUTS[:3]  #: Inputs of a term that is motion: filters know the wheels before they know a tilt.
 
-MOTION = (
-    HEADING,
-    SPEED_X,
-    SPEED_Y,
-)  #: Channels whose terms are motion of the body; those of others are read.
+#: Channels whose terms are motion of the body; those of others are read.
+MOTION = (HEADING, SPEED_X, SPEED_Y)
 
 SOFT = {"speed_mps": 0.05, "sideways_mps": 0.05, "turn_radps": 0.05, "grade_rad": 0.02, "roll_rad": 0.02}
 """Where a sign has three quarters of its size: nothing is signed at rest."""
 
-MARGIN = (
-    0.1  #: Part of a range beyond it over which a term falls to 0; a range of percentiles misses as much.
-)
+#: Part of a range beyond it over which a term falls to 0; a range of percentiles misses as much.
+MARGIN = 0.1
 LEAST_MARGIN = 0.02  #: The same of a narrow range, in the input's own unit.
 LONGEST_S = 1.0  #: A lag starts anew after a longer gap: nothing is known of what was driven.
 

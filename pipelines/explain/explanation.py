@@ -159,7 +159,7 @@ BY_SENSOR = {GYRO: "gyro", HEADING: "poses"}  #: That measure the same motion
 
 STATED = 3  #: Channels, causes or candidates that an answer lists
 LEARNED = 2  #: Learned terms that it lists
-NAMELESS = (Tier.CANDIDATE, Tier.UNEXPLAINED)
+OPEN = (Tier.CANDIDATE, Tier.UNEXPLAINED)  #: Tiers of channels without a known cause
 
 
 def channels_that_matter(result: ExplainResult) -> list[ChannelVerdict]:
@@ -256,11 +256,11 @@ def _why(result: ExplainResult) -> str:
     if terms := result.diagnosed.with_terms.learned:
         more = [f"{n} more below"] if (n := len(terms) - LEARNED) > 0 else []
         parts.append(
-            f"learned, since no name fits: {enumerated([*[t.says for t in terms[:LEARNED]], *more])}"
+            f"without a known cause, learned: {enumerated([*[t.says for t in terms[:LEARNED]], *more])}"
         )
-    nameless = [CHANNEL_WORDS[of.channel][0] for of in channels_that_matter(result) if of.tier in NAMELESS]
-    if nameless:
-        parts.append(f"no known cause for {enumerated(nameless)}")
+    unexplained = [CHANNEL_WORDS[of.channel][0] for of in channels_that_matter(result) if of.tier in OPEN]
+    if unexplained:
+        parts.append(f"no known cause for {enumerated(unexplained)}")
     return _sentences(parts) or "Nothing is to be explained."
 
 
@@ -376,8 +376,8 @@ def _learned_parts(diagnosed: DiagnosedRuns) -> Iterator[Part]:
             cells = gain.named_reduction, gain.ci, gain.reduction, gain.learner_reduction, remark
         rows.append((CHANNEL_WORDS[channel][0], each.term.says, *cells))
     if rows:
-        numbers = "square less by names", "the term adds, 95 %", "with the term", "by the learner"
-        heads = Column("no name fits in", long=True), Column("a learned term", long=True)
+        numbers = "square less by named causes", "the term adds, 95 %", "with the term", "by the learner"
+        heads = Column("no known cause in", long=True), Column("a learned term", long=True)
         note = (
             "Sums of products of speed and turn, selected by cross-validation on what the names leave; "
             "outside the speeds and turns that were driven they are off."

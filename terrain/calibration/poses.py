@@ -40,15 +40,12 @@ from terrain.robots import BicycleRobot, Robot
 from terrain.simulation.plants.planar import Ground, Planar, make_planar, move, sense
 
 LEG_S = 1.0  #: Length of a leg: a robot of 0.1 m/s moves by a hundred times the noise of motion capture.
-STRIDES = (
-    4  #: Legs begin so often within the length of one, so that a fit hardly depends on where the first does.
-)
+#: Legs begin so often within the length of one, so that a fit hardly depends on where the first does.
+STRIDES = 4
 CLOCK_S = 0.02  #: Step of the simulation.
 AVERAGED_S = 0.1  #: Poses are averaged over that on either side of an end.
-STILL_M, STILL_RAD = (
-    0.02,
-    0.02,
-)  #: A leg whose wheels move the sensor by less, and turn it by less, shows nothing.
+#: A leg whose wheels move the sensor by less, and turn it by less, shows nothing.
+STILL_M, STILL_RAD = 0.02, 0.02
 BLOCKS = 12  #: Clusters of a fit at the least, where a block is then longer than a leg.
 LONGEST_BLOCK_S = 20.0  #: Of a cluster: slower than that, grounds and temperatures change.
 MIN_LEGS = 48

@@ -4,8 +4,7 @@ Both sets are fitted together.  Each effect has a value that both share, and its
 set alone, is a candidate: one column of the evidence more, zero in the runs of the first set.  Differences are added
 while one is significant and gains on runs left out of the fit, as causes are in :mod:`terrain.discrepancy.search`;
 clusters are runs, or sessions where each set has several.  One whose gain beside the others, on runs held out, has an
-interval that holds 0 is a candidate.  What both sets have in common, known or not, is in neither
-column and cancels.
+interval that holds 0 is a candidate.  What both sets have in common, known or not, is in neither column and cancels.
 """
 
 from __future__ import annotations
@@ -72,9 +71,8 @@ class Against(NamedTuple):
 
     differences: tuple[Difference, ...]
     candidates: tuple[Difference, ...]  #: significant, but without a gain on runs held out
-    unnamed: tuple[
-        Unexplained, ...
-    ]  #: channels that differ between the sets beside these, with an input each
+    #: channels that differ between the sets beside these, with an input each
+    unnamed: tuple[Unexplained, ...]
     n_runs: tuple[int, int]  #: of the sets that were compared, those held out left out
     n_sessions: tuple[int, int]  #: 0 where runs name none
     clusters: str  #: ``runs`` or ``sessions``

@@ -335,10 +335,8 @@ def statement_of(found: Found, judgement: Judgement) -> verdict.Diagnosis:
     causes = tuple(cause for cause in stated if cause.tier is Tier.NAMED)
     of_sets = tuple(cause for cause in stated if cause.tier is Tier.SET)
     missing = {limit.name for limit in missed}
-    channels, shows = (
-        [],
-        judgement.gain.clusters != THIRDS,
-    )  # what one run has in common in itself is no cause
+    # what one run has in common in itself is no cause
+    channels, shows = [], judgement.gain.clusters != THIRDS
     for name, of in judgement.gain.channels.items():
         acting = [cause for cause in stated if name in judgement.acting[cause.name]]
         hidden = [p for effect in effects if name in effect.channels[:1] for p in effect.parameters]

@@ -23,7 +23,7 @@ from terrain.discrepancy.learner import (
     kept_terms,
     learn_terms,
     learned_gains,
-    scattered,
+    scatter_square,
 )
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.runs import (
@@ -63,9 +63,8 @@ class DiagnosedRuns:
     learned: Mapping[str, Learned]  #: by channel, what was learned beside what was named
     learned_gains: tuple[LearnedGain, ...]  #: of each learned term; empty where no run was held out
     with_terms: Simulation  #: with what was named and learned built in
-    whole: tuple[
-        ComparedRun, ...
-    ]  #: runs judged, beside that; where none was held out, beside what was named
+    #: runs judged, beside that; where none was held out, beside what was named
+    whole: tuple[ComparedRun, ...]
     whole_gain: Gain  #: of that on them
 
 
@@ -129,7 +128,9 @@ def diagnose_runs(
     last = extended or simulation
     info = problem.at(last.vector)
     noise = without_levels(info.noise, compared)
-    learned = learn_terms(last, problem.signals, compared, problem.low_pass, noise, seed, scattered(info))
+    learned = learn_terms(
+        last, problem.signals, compared, problem.low_pass, noise, scatter_square(info), seed
+    )
     gains: tuple[LearnedGain, ...] = ()
     with_terms, whole, whole_gain = last.with_learned(kept_terms(learned)), judgement.runs, judgement.gain
     if with_terms is not last and not on.in_turn:

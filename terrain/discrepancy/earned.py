@@ -91,9 +91,8 @@ class HeldOut(NamedTuple):
     plain: tuple[ComparedRun, ...]
     learned: tuple[Array, ...]  #: (m, channels) of each run
     fold: tuple[int, ...]  #: by run the part of the runs without which its extension is fitted
-    left_out: tuple[
-        tuple[int, ...], ...
-    ]  #: by part the places of its runs in the fit; empty where they are in none
+    #: by part the places of its runs in the fit; empty where they are in none
+    left_out: tuple[tuple[int, ...], ...]
     noise: Mapping[str, float]
     seed: int
     excluded: tuple[Excluded, ...] = ()

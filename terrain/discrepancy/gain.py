@@ -166,9 +166,8 @@ class Removed(NamedTuple):
     """What a cause removes beside the rest of an extension."""
 
     changes: Array  #: (channels,) root mean square of what it changes, over the noise
-    squares: (
-        Array  #: (clusters, 3, channels) before the extension, with the rest, and with the cause beside it
-    )
+    #: (clusters, 3, channels) before the extension, with the rest, and with the cause beside it
+    squares: Array
 
     def gain(self, weights: Array, seed: int) -> tuple[float, Interval]:
         """Return the part of the square before that it removes, of channels by their weights (channels,)."""

@@ -42,9 +42,8 @@ MAX_RUNS = 16
 """Runs of a label by which its ground is chosen, evenly spaced: more tell no better what all of them have in common."""
 
 N_FOLDS = 6  #: Of runs; each is predicted by a fit to the others
-N_STEPS = (
-    2  #: Gauss-Newton steps of the whole library: sensitivities at twice the track are others than at once
-)
+#: Gauss-Newton steps of the whole library: sensitivities at twice the track are others than at once.
+N_STEPS = 2
 
 Z_GROUND, LEAST_FALL = 2.33, 0.1
 """A soil, or a part of the tilt, is taken from that evidence on (one in a hundred by chance), clustered by session or

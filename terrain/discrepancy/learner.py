@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations, combinations_with_replacement
 from typing import NamedTuple
 
@@ -106,9 +107,8 @@ def _regressors(run: ComparedRun) -> Array:
 
 # -- Terms that are learned -------------------------------------------------------------------------------------
 
-ENOUGH = (
-    0.9  #: Part of the black-box reference's gain that few products have to reach, to be preferred to more.
-)
+#: Part of the black-box reference's gain that few products have to reach, to be preferred to more.
+ENOUGH = 0.9
 MAX_PRODUCTS = 30  #: Products of a term; the black-box reference has some eighty.
 #: Groups of runs, or sessions, of the cross-validation; with fewer nothing is learned.
 MAX_GROUPS, MIN_GROUPS = 12, 3
@@ -133,9 +133,8 @@ class Learned(NamedTuple):
     """What was learned of one channel."""
 
     term: LearnedTerm | None  #: None where none is better than none
-    inner_gain: (
-        float  #: part of the square, before the causes, that causes and term remove in the inner folds
-    )
+    #: part of the square, before the causes, that causes and term remove in the inner folds
+    inner_gain: float
     reference_gain: float  #: that the black-box reference removes there; NaN where there are too few runs
     left_std: float  #: beside the noise, of what is left there, in the channel's unit
     noise_std: float  #: root mean square of the noise of these runs
@@ -147,8 +146,8 @@ def learn_terms(
     compared: Sequence[ComparedRun],
     low_pass: LowPass,
     noise: Noise,
+    scatter: Array,
     seed: int = 0,
-    scattered: Array | None = None,
 ) -> dict[str, Learned]:
     """Return by channel what was learned on runs; of channels that none of them measured nothing.
 
@@ -157,9 +156,9 @@ def learn_terms(
 
     Parameters
     ----------
-    scattered : (channels,) square, over all rows, of what differs from run to run by itself, in the channels' units
     simulation : with all named causes built in, and what was learned before
     signals, compared : of the runs, faults repaired; and the same beside the simulation before the causes
+    scatter : (channels,) of :func:`scatter_square`
     seed : of the groups of the cross-validation, where runs are not of several sessions
     """
     by_id = {run.run_id: run for run in compared}
@@ -173,6 +172,7 @@ def learn_terms(
     every = np.concatenate([inputs for _, inputs in steps_inputs])
     ranges = driven_ranges([inputs for _, inputs in steps_inputs])
     references = _reference_errors(compared, groups)
+    residuals = [left_by(simulation, run, low_pass) for run in runs]
     known: dict[tuple[str, ...], list[Array]] = {}  # of the last dictionary: those of motion are one
     for channel in ORDER:
         # without a heading of its own the gyro shows the motion
@@ -182,10 +182,9 @@ def learn_terms(
         products, grams = dictionary(every, channel), []
         if products not in known:
             known = {products: [columns_of(products, x, np.full(len(x), dt)) for dt, x in steps_inputs]}
-        for run, columns in zip(runs, known[products], strict=True):
-            rows = rows_of(run, simulation.planar_on(run.terrain), simulation.vector, (), low_pass)
-            left = rows.residual[:, [CHANNELS.index(shown)]]
-            table = np.hstack([term_rows(run, simulation, low_pass, shown, channel, columns), left])
+        for run, columns, left in zip(runs, known[products], residuals, strict=True):
+            seen = term_rows(run, simulation, low_pass, shown, channel, columns)
+            table = np.hstack([seen, left[:, [CHANNELS.index(shown)]]])
             table = table[np.isfinite(table).all(axis=1)]
             grams.append((table.T @ table, len(table)))
         sums = np.zeros((groups.max() + 1, len(products) + 1, len(products) + 1))
@@ -199,7 +198,7 @@ def learn_terms(
         errors = cross_validated(sums)
         reference = float(references[c])
         n = size_of(errors, (1.0 - ENOUGH) * before + ENOUGH * reference)
-        by_chance = 0.0 if scattered is None else CHANCE / len(runs) * float(scattered[c])
+        by_chance = CHANCE / len(runs) * float(scatter[c])
         n = n if errors[:, 0].sum() - errors[:, n].sum() > by_chance else 0
         sizes = np.concatenate([noise.size(run.pace_mps)[:, c] for run in compared])
         noise_std = float(np.sqrt(np.nanmean(sizes**2)))
@@ -213,15 +212,20 @@ def learn_terms(
             used = region_of_term(names, ranges)
             term = LearnedTerm(channel, names, coefficients, covariance, used, left_std)
             added = [term.predict(inputs, np.full(len(inputs), dt))[0] for dt, inputs in steps_inputs]
-            says = where_it_acts(channel, names, np.concatenate(added), every)
-            term = LearnedTerm(channel, names, coefficients, covariance, used, left_std, says)
+            term = replace(term, says=where_it_acts(channel, names, np.concatenate(added), every))
             simulation = simulation.with_learned([term])
+            residuals = [left_by(simulation, run, low_pass) for run in runs]
         inner_gain, reference_gain = (1.0 - np.array([errors[:, n].sum(), reference]) / before).tolist()
         learned[shown] = Learned(term, inner_gain, reference_gain, left_std, noise_std)
     return learned
 
 
-def scattered(info: Evidence) -> Array:
+def left_by(simulation: Simulation, run: Signals, low_pass: LowPass) -> Array:
+    """Return what a simulation leaves of a run (m, channels), measured minus predicted."""
+    return rows_of(run, simulation.planar_on(run.terrain), simulation.vector, (), low_pass).residual
+
+
+def scatter_square(info: Evidence) -> Array:
     """Return the square (channels,), over all rows, of what differs from run to run by itself."""
     std = info.nuisance_std[:, None, None]
     return np.asarray(
@@ -288,9 +292,8 @@ class LearnedGain(NamedTuple):
     reduction: float  #: that both remove
     ci: Interval  #: 95 % interval of what the term adds to that
     learner_reduction: float  #: that the black-box learner removes
-    is_kept: (
-        bool  #: whether it is built into the extended robot: a term that makes held-out runs worse is not
-    )
+    #: whether it is built into the extended robot: a term that makes held-out runs worse is not
+    is_kept: bool
 
 
 def learned_gains(

@@ -390,12 +390,8 @@ def from_legs(name: str, terrain: str, legs: Sequence[Leg]) -> Scenario:
     return Scenario(name, RATE_HZ, time_s, _twists(legs, time_s), (Patch(0.0, terrain),))
 
 
-COMMANDS: tuple[str, ...] = (
-    "time_s",
-    "speed_x_mps",
-    "speed_y_mps",
-    "yaw_rate_radps",
-)  # columns of their file
+#: Columns of a file of commands.
+COMMANDS: tuple[str, ...] = ("time_s", "speed_x_mps", "speed_y_mps", "yaw_rate_radps")
 
 
 def from_commands(name: str, robot: Robot, terrain: str, commands: Array) -> Scenario:

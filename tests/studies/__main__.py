@@ -25,7 +25,6 @@ STUDIES = {
     "foreign": "hide effects in simulators of other equations, and in MuJoCo, explain them, count",
     "trials": "hide effects in simulated runs, diagnose them blindly, count what is right",
     "real-sets": "what explain states of measured sets under each label, and what it gains",
-    "learned": "what learned terms gain on measured sets, beside names and the learner",
     "ablation": "what each signal set is worth to the classifier, on all labelled sets",
     "live": "latency of the live chain by stage, and of the service with many robots",
     "soak": "the service for minutes or hours under robots that misbehave at random",

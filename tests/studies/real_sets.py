@@ -27,7 +27,6 @@ from terrain.discrepancy.compared import CHANNEL_WORDS, beside_extended
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns
 from terrain.discrepancy.gain import HALF, gain_of
 from terrain.discrepancy.learner import ENOUGH, kept_terms, replay_std
-from terrain.discrepancy.verdict import INTERVAL_T
 from terrain.effects import CHANNELS
 from terrain.errors import ConfigError, DataError
 from terrain.records import Label, RunLog
@@ -36,6 +35,7 @@ EXAMPLE = "python tests/studies real-sets --data ~/sets --sets marmotte,borealtc
 FOREIGN = "zork"  #: A label that is no soil
 ALL = "all"  #: Channels, in the place of one
 COVERS = 0.90, 0.98  #: Accepted coverage of a 95 % interval
+NORMAL_95 = 1.96  #: Half of such an interval, in standard deviations
 OTHER_THAN = {"grass": "asphalt"}  #: Another soil than that, grass of all others
 
 
@@ -197,7 +197,7 @@ def whole_rows(name: str, label: str, found: DiagnosedRuns) -> list[WholeRow]:
     for channel, of in gain.channels.items():
         c = CHANNELS.index(channel)
         known = np.isfinite(apart[:, c]) & np.isfinite(std[:, c])
-        inside = np.abs(apart[known, c]) <= INTERVAL_T * std[known, c]
+        inside = np.abs(apart[known, c]) <= NORMAL_95 * std[known, c]
         covered = float(inside.mean()) if known.any() else np.nan
         before = named.channels[channel].reduction if named and channel in named.channels else np.nan
         both = of_all.channels[channel].reduction if of_all and channel in of_all.channels else np.nan

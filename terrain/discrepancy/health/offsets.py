@@ -11,6 +11,7 @@ from terrain.discrepancy.health.agreement import LEAST, G, H
 from terrain.discrepancy.health.fault import KINDS, Change, Column, Fault, FaultKind, FaultStatus, fault_of
 from terrain.discrepancy.health.sessions import faulty_runs, halves
 from terrain.discrepancy.runs import Rows
+from terrain.records import Array
 from terrain.robots import Robot
 
 OFFSET_SIGMAS = 4.0  #: An offset is over the largest by so many standard deviations.
@@ -87,13 +88,8 @@ def _drift_of(run: Rows, channel: int) -> tuple[float, float, float]:
         measured, predicted = run.measured[known, c], run.predicted[known, c]
         if known.sum() < MIN_ROWS:
             return (*(found or [(math.nan, math.nan)])[0], math.nan)
-        varies = np.std(predicted) > LEAST[c]
         time_s = run.time_s[known] - run.time_s[known].mean()
-        basis = np.column_stack([time_s, np.ones(measured.size), *([predicted] if varies else [])])
-        fit, *_ = np.linalg.lstsq(basis, measured, rcond=None)
-        n_independent = max(measured.size * min(run.period_s, 1.0), 1.0)
-        spread = np.linalg.pinv(basis.T @ basis / measured.size)[0, 0] / n_independent
-        found.append((float(fit[0]), float(np.std(measured - basis @ fit) * np.sqrt(spread))))
+        found.append(_first_of_fit([time_s, np.ones(measured.size)], predicted, measured, c, run.period_s))
     return *found[0], found[1][0] if channel in WITNESS else math.nan
 
 
@@ -111,11 +107,17 @@ def constant_of(run: Rows, channel: int) -> tuple[float, float]:
     margin = NEAR_ZERO * (high - low) + LEAST[channel]
     if low > margin or high < -margin:
         return math.nan, math.nan
+    value, std = _first_of_fit([np.ones(measured.size)], predicted, measured, channel, run.period_s)
+    return (value, std) if measured.min() <= value <= measured.max() else (math.nan, math.nan)
+
+
+def _first_of_fit(
+    columns: list[Array], predicted: Array, measured: Array, channel: int, period_s: float
+) -> tuple[float, float]:
+    """Return the coefficient of the first column, fitted beside a gain where the prediction varies, and its error."""
     varies = np.std(predicted) > LEAST[channel]
-    basis = np.column_stack([np.ones(measured.size), *([predicted] if varies else [])])
+    basis = np.column_stack([*columns, *([predicted] if varies else [])])
     fit, *_ = np.linalg.lstsq(basis, measured, rcond=None)
-    n_independent = max(measured.size * min(run.period_s, 1.0), 1.0)  # what is left changes within seconds
-    spread = np.linalg.inv(basis.T @ basis / measured.size)[0, 0] / n_independent
-    if not measured.min() <= fit[0] <= measured.max():
-        return math.nan, math.nan
+    n_independent = max(measured.size * min(period_s, 1.0), 1.0)  # what is left changes within seconds
+    spread = np.linalg.pinv(basis.T @ basis / measured.size)[0, 0] / n_independent
     return float(fit[0]), float(np.std(measured - basis @ fit) * np.sqrt(spread))

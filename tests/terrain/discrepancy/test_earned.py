@@ -5,12 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from terrain.discrepancy.diagnose import diagnose
+from terrain.discrepancy import diagnose as diagnose_module
+from terrain.discrepancy import earned
+from terrain.discrepancy.diagnose import diagnose, find_causes
 from terrain.discrepancy.diagnosed_runs import diagnose_runs, held_out_gain
-from terrain.discrepancy.gain import earns
+from terrain.discrepancy.earned import crossed_runs, judge
+from terrain.discrepancy.gain import earns, part_removed, ratio_of_sums, removed_by, weights_of
 from terrain.discrepancy.held_out import split_runs
 from terrain.discrepancy.verdict import Tier
-from terrain.effects import effect_named
+from terrain.effects import CHANNELS, effect_named
 from terrain.records import Stream
 from terrain.robots import load_robot
 
@@ -132,3 +135,60 @@ def test_sessions_are_held_out_and_a_run_that_cannot_be_compared_is_excluded_wit
 )
 def test_a_gain_is_earned_above_0_and_by_half_of_the_learners(reduction, low, learner, shown, expected):
     assert earns(reduction, (low, 1.0), learner, shown) is expected
+
+
+@pytest.mark.parametrize(("others", "is_named"), [(20.0, True), (5.0, False)])
+def test_a_channel_made_slightly_worse_speaks_against_a_cause_that_removes_little_elsewhere(
+    turned, monkeypatch, others, is_named
+):
+    """The cause adds 5 % to the square of the currents, over the noise, and removes some times that elsewhere."""
+    simulation = diagnosed(turned).simulation
+    found = find_causes(turned, simulation, FEW)
+    on = crossed_runs(found.problem.signals, simulation, found.problem.low_pass, found.noise, 0)
+    assert judge(found.fit, found.built_in, on).reasons == {}
+    weights = weights_of(on.noise)
+    worse, better = CHANNELS.index("current_a"), CHANNELS.index("speed_y_mps")
+
+    def planted(*about):
+        removed = removed_by(*about)
+        squares = np.zeros_like(removed.squares)
+        squares[:, :, worse] = np.array([1.0, 1.0, 1.05]) / weights[worse]
+        squares[:, :, better] = np.array([0.05 * others, 0.05 * others, 0.0]) / weights[better]
+        return removed._replace(squares=squares)
+
+    monkeypatch.setattr(earned, "removed_by", planted)
+    reasons = judge(found.fit, found.built_in, on).reasons
+    if is_named:
+        assert reasons == {}
+    else:
+        assert "it makes sum of the motor currents worse, by 5 % of its square" in reasons["camera_yaw"]
+
+
+def test_no_more_than_all_of_a_square_is_removed():
+    part, whole = np.array([2.0, 1.8, 1.9]), np.full(3, 2.0)
+    (_, (low, high)), (ratio, (least, most)) = ratio_of_sums(part, whole, 0), part_removed(part, whole, 0)
+    assert high > 1.0
+    assert (ratio, least, most) == (pytest.approx(0.95), low, 1.0)
+
+
+@pytest.mark.parametrize(("size", "is_named"), [(0.05, True), (0.2, False)])
+def test_a_size_that_no_builder_would_believe_is_never_named(hide, size, is_named):
+    library = (effect_named("wheel_radius"), effect_named("camera_yaw"))
+    diagnosis = diagnosed(hide({"wheel_radius_ratio": size}, n=8), library=library).diagnosis
+    assert [cause.name for cause in diagnosis.causes] == ["wheel_radius"] * is_named
+    if not is_named:
+        (candidate,) = [each for each in diagnosis.candidates if each.name == "wheel_radius"]
+        assert "something that is missing acts like" in candidate.reason
+        assert candidate.parameters[0].value == pytest.approx(size, abs=0.02)
+        assert of_channel(diagnosis, "speed_x_mps").tier is Tier.CANDIDATE
+
+
+def test_candidates_for_one_channel_are_what_a_next_drive_decides_between(hide, monkeypatch):
+    asked = []
+    monkeypatch.setattr(diagnose_module, "next_drive", lambda simulation, sets, *_: asked.append(sets))
+    library = tuple(map(effect_named, ("rolling_resistance", "viscous_drag", "payload", "camera_yaw")))
+    diagnosis = diagnosed(hide({"motor_drift_ratio": 0.6}, n=8, duration_s=20.0), library=library).diagnosis
+    of_current = [each.name for each in diagnosis.candidates if each.channels[0] == "current_a"]
+    assert len(of_current) > 1
+    assert asked[-1] == [tuple(of_current[:3])]
+    assert diagnosis.ambiguous_sets == ()

@@ -634,6 +634,14 @@ def test_an_offset_is_not_beyond_what_was_measured_and_not_where_the_heading_has
     assert np.isfinite(constant_of(rows, G)).all()
 
 
+def test_an_offset_that_each_half_of_the_runs_has_otherwise_is_no_fault_of_the_logger():
+    gyros = [
+        of_gyro(lambda _, w, by=by: w + by)(run)
+        for by, run in zip([0.9, 1.9] * 3, sound(wide=True), strict=True)
+    ]
+    assert not [fault for fault in faults(on_one_clock(gyros)) if fault.change.kind is OFFSET]
+
+
 def test_a_zero_that_drifts_in_all_runs_is_named_and_one_that_wanders_is_not():
     drifts = [of_gyro(lambda t, w: w + 0.006 * t)(run) for run in sound()]
     (fault,) = faults(on_one_clock(drifts))

@@ -8,9 +8,17 @@ import pytest
 
 from pipelines.explain.explain import explain
 from pipelines.report.results import as_json
-from terrain.discrepancy.compared import ComparedRun
+from terrain.discrepancy.compared import ComparedRun, compare_runs
 from terrain.discrepancy.gain import gain_of
-from terrain.discrepancy.learner import DRIVEN, cross_validated, fitted, predicted_residuals, size_of
+from terrain.discrepancy.learner import (
+    DRIVEN,
+    cross_validated,
+    fitted,
+    learn_terms,
+    predicted_residuals,
+    scatter_square,
+    size_of,
+)
 from terrain.effects import CHANNELS
 from terrain.extension import extended_yaml
 from terrain.robots import load_robot
@@ -20,6 +28,7 @@ from terrain.simulation.run import simulate
 # -- A black-box reference finds what depends on the inputs, no more than is there, beside the names -----------
 
 C, CHANNEL, STD = CHANNELS.index("speed_x_mps"), "speed_x_mps", 0.05
+T = CHANNELS.index("turning_current_a")
 
 
 def a_run(seed, hidden=0.0, named=None, late=0, n=300):
@@ -107,6 +116,19 @@ def test_a_residual_that_few_products_do_not_reach_gets_as_many_as_have_the_leas
     errors = np.tile([10.0, 2.0, 1.0, 0.9], (8, 1)) + 0.3 * np.random.default_rng(0).standard_normal((8, 4))
     errors[:, 3] = errors[:, 2] - 0.1 + 0.4 * np.resize([1.0, -1.0], 8)
     assert (size_of(errors, math.inf), size_of(errors, 0.0)) == (2, 3)
+
+
+def test_what_runs_differ_by_at_random_is_no_law_of_them(hide, pose):
+    """Six runs whose ground resists turns more: a law, unless runs differ by as much from one to the next."""
+    problem = pose(hide({"turning_resistance_ratio": 0.3}, duration_s=20.0))
+    simulation, low_pass = problem.simulation, problem.low_pass
+    info = problem.at(simulation.vector)
+    compared = compare_runs(simulation, None, problem.signals, low_pass)
+    about = simulation, problem.signals, compared, low_pass, info.noise
+    square = scatter_square(info)
+    assert square[T] > 0.0
+    assert learn_terms(*about, square)["turning_current_a"].term is not None
+    assert learn_terms(*about, 100.0 * square)["turning_current_a"].term is None
 
 
 # -- A law that no name fits, from runs to a robot that moves by it -------------------------------------------------

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from studies.blind_trials.trial import simulation_of
 
+from terrain.discrepancy import next_drive as next_drive_module
 from terrain.discrepancy.evidence import evidence_at
 from terrain.discrepancy.next_drive import commands_of, next_command, next_drive
 from terrain.discrepancy.runs import low_pass_of, signals_of
@@ -114,3 +115,13 @@ def test_it_is_a_command_of_the_described_robot():
         "--out next_drive"
     )
     assert next_command(None, "husky", HUSKY.robot, ()) is None
+
+
+def test_a_drive_that_is_improved_leg_by_leg_stays_in_its_room(monkeypatch):
+    monkeypatch.setattr(next_drive_module, "ROOM_M", 4.5)
+    monkeypatch.setattr(next_drive_module, "ROOM_S", 0.0)
+    info = evidence_of(HUSKY, drives(HUSKY, "straight"), ["wheel_radius_ratio"])
+    # the farther a drive goes in one direction, the more it shows of a radius
+    missed = [Limit("wheel_radius_ratio", np.inf, "ratio", "any speed")]
+    suggested = next_drive(HUSKY, (), missed, info)
+    assert max(suggested.length_m, suggested.width_m) <= 4.5

@@ -59,3 +59,14 @@ def test_few_runs_or_values_that_are_all_alike_have_no_pattern():
     assert pattern_of(PLACE[:5], np.ones(5), PLACE[:5], [""] * 5) is None
     assert pattern_of(np.zeros(N), np.ones(N), PLACE, NO_SESSION) is None
     assert pattern_of(PLACE, np.full(N, np.inf), PLACE, NO_SESSION) is None
+
+
+@pytest.mark.parametrize("draw", ["uniform", "standard_normal", "laplace"])
+def test_the_tail_of_a_law_and_its_halves_are_no_groups_of_runs(draw):
+    """Of sixty runs at random the likelihood alone finds two groups, which are not apart."""
+    rng, found = np.random.default_rng(5), []
+    for _ in range(40):
+        value = 0.02 * getattr(rng, draw)(size=60)
+        pattern = pattern_of(value, np.full(60, 1e-8), np.arange(60.0), [""] * 60)
+        found += [pattern.kind] * (pattern.z > 4.5)
+    assert Kind.GROUPS not in found
