@@ -184,6 +184,8 @@ def answer_of(result: ExplainResult) -> str:
         says, removes = learned[0].says, percent_text(learned[0].reduction)
         of = f"the squared error of the {CHANNEL_WORDS[learned[0].channel][0]}"
         return f"No known cause fits what {robot} does here: {says}; a learned term of it removes {removes} of {of}."
+    if not channels and result.diagnosis.not_shown:
+        return f"These runs confirm nothing that the simulation of {robot} gets wrong, and could not show all of it."
     if not channels:
         return f"These runs show nothing that the simulation of {robot} gets wrong."
     first = channels[0]

@@ -185,7 +185,7 @@ def held_out_gain(diagnosed: DiagnosedRuns, robot: Robot, seed: int) -> HeldOutG
 def gain_built_in(diagnosed: DiagnosedRuns, seed: int) -> Gain | None:
     """Return what effects and terms that a simulation has already gain on all runs, over it without; None without any.
 
-    None of the runs was used to find them, as far as is known.
+    Whether it was found by some of these runs is not known.
     """
     simulation = diagnosed.simulation
     if not simulation.effects and not simulation.learned:
@@ -201,7 +201,7 @@ def gain_built_in(diagnosed: DiagnosedRuns, seed: int) -> Gain | None:
     )
     pairs = zip(on.plain, on.signals, strict=True)
     runs = [beside_extended(run, own, simulation, low_pass) for run, own in pairs]
-    return on._replace(how=f"{len(runs)} runs, none of which was used to find it").gain(runs)
+    return on._replace(how=f"{len(runs)} runs, by some of which it may have been found").gain(runs)
 
 
 # -- The simulation, and the description of the robot, with what it lacked built in ------------------------

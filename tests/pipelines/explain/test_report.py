@@ -98,6 +98,10 @@ def test_the_first_screen_answers_what_why_how_certain_what_for_and_what_next(ex
         assert stated in text
     nothing = explained().report
     assert nothing.answer == "These runs show nothing that the simulation of a<b> gets wrong."
+    blind = explained(not_shown=LIMITS[1:2]).report
+    assert blind.answer.startswith(
+        "These runs confirm nothing that the simulation of a<b> gets wrong, and could not"
+    )
     assert "What next Nothing is open that a drive of this robot would show" in text_of(explained())
 
 
