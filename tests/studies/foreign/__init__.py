@@ -17,7 +17,7 @@ from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import JobsSettings, Names, setting
 from pipelines.report.tree import Column, Report, Table
 from studies.blind_trials.scoring import Score
-from studies.foreign.scoring import by_effect, table_of
+from studies.foreign.scoring import FALSE, by_effect, table_of
 from studies.foreign.trial import ROWS, Case, ForeignTrial, cases_of, run_case
 from terrain.errors import ConfigError
 
@@ -100,7 +100,7 @@ def report(result: ForeignResult) -> Report:
     false = tuple(
         (f"{t.engine} {t.world}", t.number, t.effect or "nothing", f"{t.size:.4g}", _answer_text(t))
         for t in result.trials
-        if t.outcome in ("wrong", "company") or (not t.effect and t.outcome != "silent")
+        if t.outcome in FALSE or (not t.effect and t.outcome != "silent")
     )
     return Report(
         "Trials in foreign worlds",
@@ -112,7 +112,7 @@ def report(result: ForeignResult) -> Report:
 
 def _answer_text(trial: ForeignTrial) -> str:
     answer = trial.answer
-    values = ", ".join(f"{name} {value:.3g}" for name, value in answer.named.items())
+    values = ", ".join(f"{name} {value[0]:.3g}" for name, value in answer.named.items())
     sets = "; ".join(" or ".join(names) for names in answer.sets)
     parts = values, sets, ", ".join(answer.varying), "; ".join(answer.faults), answer.refusal
     return " | ".join(part for part in parts if part) or ", ".join((*answer.unexplained, *answer.learned))

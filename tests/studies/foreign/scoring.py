@@ -8,7 +8,8 @@ from collections.abc import Iterator, Sequence
 from studies.blind_trials.scoring import Score, score
 from studies.foreign.trial import OVER_LIMIT, ForeignTrial, Outcome
 
-FALSE = (Outcome.WRONG, Outcome.COMPANY)
+FALSE = (Outcome.WRONG, Outcome.COMPANY, Outcome.VALUE)
+HONEST = (Outcome.RIGHT, Outcome.NEAREST, Outcome.SET, Outcome.UNEXPLAINED, Outcome.CANDIDATE)
 SEEN = 5.0 / OVER_LIMIT  #: part of the size asked for, from which silence counts
 
 
@@ -23,7 +24,7 @@ def _scores(trials: Sequence[ForeignTrial]) -> Iterator[tuple[str, Score]]:
         some = [t for t in trials if t.effect and t.engine == engine]
         if engine == "plain":
             yield "plain: wrong or with false company", score((t.outcome in FALSE for t in some), most=0.03)
-            honest = (t.outcome not in (*FALSE, Outcome.SILENT) for t in some)
+            honest = (t.outcome in HONEST for t in some)
             yield "plain: right, nearest, in a set or unexplained", score(honest, least=0.9)
             seen = [t for t in some if t.over_limit >= SEEN * OVER_LIMIT]
             yield (
@@ -46,10 +47,17 @@ def _scores(trials: Sequence[ForeignTrial]) -> Iterator[tuple[str, Score]]:
                 score((t.outcome in FALSE for t in own), **most),
             )
             yield f"{engine}, {world}: named or in a set", score((t.outcome in named for t in own), **least)
-    yield (
-        "nothing hidden: anything stated",
-        score((t.outcome is not Outcome.SILENT for t in quiet), most=0.02),
-    )
+    alone = (Outcome.SILENT, Outcome.CANDIDATE, Outcome.OTHER)  # a candidate alone is no statement
+    yield "nothing hidden: anything stated", score((t.outcome not in alone for t in quiet), most=0.02)
+    yield "nothing hidden: beyond what calibration leaves", score(map(is_news, quiet))
+    yield "nothing hidden: a candidate alone", score(t.outcome is Outcome.OTHER for t in quiet)
+
+
+def is_news(trial: ForeignTrial) -> bool:
+    """Return whether runs in which nothing is hidden are answered by more than what calibration leaves."""
+    answer = trial.answer
+    more = {*answer.unexplained, *answer.learned} - {*trial.known}
+    return bool(answer.causes or answer.sets or answer.varying or answer.faults or answer.refusal or more)
 
 
 def by_effect(trials: Sequence[ForeignTrial]) -> list[tuple[str, str, int, str]]:

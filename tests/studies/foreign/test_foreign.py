@@ -165,7 +165,6 @@ def test_names_of_answers_are_those_of_the_catalogue_or_of_what_it_lacks():
 @pytest.mark.parametrize(
     ("answer", "outcome"),
     [
-        (Answer(causes=("payload",)), Outcome.RIGHT),
         (Answer(causes=("motor_constant",)), Outcome.NEAREST),
         (Answer(causes=("payload", "scrub")), Outcome.COMPANY),
         (Answer(causes=("scrub",), candidates=("payload",)), Outcome.WRONG),
@@ -173,14 +172,47 @@ def test_names_of_answers_are_those_of_the_catalogue_or_of_what_it_lacks():
         (Answer(sets=(("scrub", "lever_arm"),)), Outcome.WRONG),
         (Answer(causes=("payload",), faults=("the gyro is in deg/s",)), Outcome.COMPANY),
         (Answer(refusal="too few runs"), Outcome.WRONG),
-        (Answer(candidates=("scrub",)), Outcome.HONEST),
+        (Answer(causes=("payload",), named={"payload_ratio": (0.35, 0.2, 0.5)}), Outcome.RIGHT),
+        (Answer(causes=("payload",), named={"payload_ratio": (0.45, 0.44, 0.46)}), Outcome.RIGHT),  # 12 % off
+        (Answer(causes=("payload",), named={"payload_ratio": (0.7, 0.6, 0.8)}), Outcome.VALUE),
+        (Answer(causes=("payload",)), Outcome.VALUE),
+        (Answer(causes=("payload", "scrub"), named={"payload_ratio": (0.4, 0.3, 0.5)}), Outcome.COMPANY),
+        (Answer(candidates=("scrub",)), Outcome.OTHER),
+        (Answer(candidates=("scrub", "motor_constant")), Outcome.CANDIDATE),
+        (Answer(candidates=("payload",), unexplained=("speed_x_mps",)), Outcome.UNEXPLAINED),
         (Answer(unexplained=("current_a",)), Outcome.SILENT),  # known before anything was hidden
-        (Answer(unexplained=("speed_x_mps",)), Outcome.HONEST),
+        (Answer(unexplained=("speed_x_mps",)), Outcome.UNEXPLAINED),
         (Answer(), Outcome.SILENT),
     ],
 )
 def test_an_answer_is_worth_what_the_physics_says(answer, outcome):
-    assert outcome_of(answer, ("payload",), ("motor_constant",), ("current_a",)) is outcome
+    known, hidden = ("current_a",), {"payload_ratio": 0.4}
+    assert outcome_of(answer, ("payload",), ("motor_constant",), known, hidden) is outcome
+
+
+def test_values_that_right_names_have_are_of_the_catalogue_and_follow_the_size():
+    for place in WORLDS:
+        world = WORLDS[place]()
+        drive = load_robot(world.robot).drive
+        names = {each.name: {p.name for p in each.parameters} for each in library_of(drive)}
+        for effect in effects_of(*place):
+            if effect.name == "wheels_apart" and world.name == "skid":
+                continue  # of the motion
+            values = effect.values(world, 0.02)
+            of_right = {name for right in effect.right for name in names.get(right, ())}
+            assert not of_right or {*values} & of_right or effect.name in ("sticky_rollers", "balls_rub")
+            assert all(
+                np.sign(value) == -np.sign(effect.values(world, -0.02)[name])
+                for name, value in values.items()
+            )
+
+
+def test_wheels_that_are_apart_have_a_wider_effective_track():
+    world = WORLDS["plain", "skid"]()
+    wider = effects_of("plain", "skid")[[e.name for e in effects_of("plain", "skid")].index("wheels_apart")]
+    assert 0.0 < wider.values(world, 0.15)["effective_track_ratio"] < 0.15  # the length resists as before
+    geometric_m = 2 * SKID.wheels_m[0, 1]
+    assert 1.3 < worlds.track_m(world) / geometric_m < 2.5  # Mandow et al. 2007
 
 
 def test_trials_take_what_the_catalogue_has_and_what_it_lacks_in_turn():
@@ -232,20 +264,33 @@ def test_the_report_counts_what_was_answered():
         fields = {"row": row, "number": 0, "engine": row.partition("_")[0], "world": "skid", "effect": effect}
         about = {"size": 0.1, "over_limit": 6.0 if effect else 0.0, "inside": True, "right": ("payload",)}
         return ForeignTrial(
-            **fields, **about, nearest=(), known=(), answer=answer, outcome=outcome, seconds=1.0
+            **fields,
+            **about,
+            hidden={},
+            nearest=(),
+            known=("current_a",),
+            answer=answer,
+            outcome=outcome,
+            seconds=1.0,
         )
 
     right = of("payload", Outcome.RIGHT, Answer(causes=("payload",)))
-    wrong = of("payload", Outcome.WRONG, Answer(causes=("scrub",), named={"scrub_ratio": 0.2}))
+    wrong = of("payload", Outcome.WRONG, Answer(causes=("scrub",), named={"scrub_ratio": (0.2, 0.1, 0.3)}))
     trials = (
         *(right, right, right, wrong, of("payload", Outcome.SILENT, Answer())),
         *(of("", Outcome.SILENT, Answer()), of("", Outcome.WRONG, Answer(causes=("scrub",)))),
+        *(
+            of("payload", Outcome.OTHER, Answer(candidates=("scrub",))),
+            of("payload", Outcome.VALUE, Answer()),
+        ),
+        of("", Outcome.UNEXPLAINED, Answer(unexplained=("current_a",))),
     )
     table = scoring.table_of(trials)
-    assert table["plain: wrong or with false company"][:2] == (1, 5)
-    assert table["plain: right, nearest, in a set or unexplained"][:2] == (3, 5)
-    assert table["plain: silent at 5 times the limit"][:2] == (1, 5)
-    assert table["nothing hidden: anything stated"][:2] == (1, 2)
+    assert table["plain: wrong or with false company"][:2] == (2, 7)
+    assert table["plain: right, nearest, in a set or unexplained"][:2] == (3, 7)
+    assert table["plain: silent at 5 times the limit"][:2] == (1, 7)
+    assert table["nothing hidden: anything stated"][:2] == (2, 3)
+    assert table["nothing hidden: beyond what calibration leaves"][:2] == (1, 3)
     result = foreign.ForeignResult(
         n=7, seed=0, rows=("plain_skid",), table=table, seconds=(1.0, 1.0), trials=trials
     )

@@ -1,8 +1,8 @@
 """One trial: a builder calibrates a robot's description by ``terrain explain``, something changes, and it is asked for.
 
 Whatever the world does otherwise than the nominal description is in the extended one before anything is hidden.  What
-that one still states of runs in which nothing is hidden, without naming anything, is known to its builder and is no
-answer.
+that one still leaves unexplained where nothing is hidden is known to its builder: it is no answer to what is hidden.
+Where nothing is hidden it counts as stated all the same, and what is new beside it is counted apart.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from terrain.discrepancy.evidence import Z_EFFECT, Evidence, evidence_at, margin
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.runs import Simulation, low_pass_of, signals_of
 from terrain.discrepancy.search import names_of
-from terrain.effects import library_of
+from terrain.effects import PARAMETER, library_of, parameters_of
 from terrain.errors import DataError
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.records import RunLog
@@ -38,15 +38,28 @@ OVER_LIMIT = 6.0  #: size of an effect over its detection limit
 CLOSE = 0.15  #: by which that may be missed
 N_PROBED = 4  #: runs that sizes are found by
 LEAST = 0.02  #: part of the largest size that is hidden at the least
+VALUE_RATIO = 0.2  #: by which a stated value may miss the hidden one, where its interval does not hold that
+
+Stated = tuple[float, float, float]  #: a value and its 95 % interval
 
 
 class Outcome(StrEnum):
-    """What an answer is worth, by the physics of what is hidden."""
+    """What an answer is worth, by the physics of what is hidden.
 
-    RIGHT = "right"  #: the effect is named, and nothing else
+    A candidate is honest where it is what is hidden, or comes nearest: the page lists it first for the channel.  Any
+    other candidate is no false name, and no answer either.  Of what comes nearest, and of the members of a set, values
+    are not compared, for what is hidden has another law, or none of them is stated.
+    """
+
+    RIGHT = "right"  #: the effect is named with its value, and nothing else
     NEAREST = "nearest"  #: what comes nearest is named, and nothing else
     SET = "set"  #: a set of names holds one of these
-    HONEST = "honest"  #: a channel is unexplained, a term is learned, or there is a candidate
+    UNEXPLAINED = (
+        "unexplained"  #: nothing is named, and a channel is unexplained or a term is learned that was not
+    )
+    CANDIDATE = "candidate"  #: nothing but candidates, the effect or what comes nearest among them
+    OTHER = "other candidate"  #: nothing but candidates, none of which is
+    VALUE = "wrong value"  #: the effect is named, and nothing else, but its value is not right
     COMPANY = "company"  #: something that is not there is named beside it
     WRONG = "wrong"  #: something that is not there is named
     SILENT = "silent"
@@ -55,7 +68,9 @@ class Outcome(StrEnum):
 class Answer(NamedTuple):
     """What ``terrain explain`` states."""
 
-    named: Mapping[str, float] = {}  #: by parameter, of the named causes
+    named: Mapping[
+        str, Stated
+    ] = {}  #: by parameter, of what is built in; of one that varies mean and scatter
     causes: tuple[str, ...] = ()
     sets: tuple[tuple[str, ...], ...] = ()
     varying: tuple[str, ...] = ()
@@ -80,14 +95,40 @@ class ForeignTrial:
     inside: bool  #: whether the catalogue has it
     right: tuple[str, ...]
     nearest: tuple[str, ...]
+    hidden: Mapping[
+        str, float
+    ]  #: values by parameter, beside the calibrated description, where the catalogue has them
     known: tuple[str, ...]  #: channels and candidates that the calibrated description leaves
     answer: Answer
     outcome: Outcome
     seconds: float
 
 
-def outcome_of(answer: Answer, right: Sequence[str], nearest: Sequence[str], known: Sequence[str]) -> Outcome:
-    """Return what an answer is worth.
+def value_is_right(stated: Mapping[str, Stated], hidden: Mapping[str, float]) -> bool:
+    """Return whether stated values hold those that are hidden within their intervals, or miss them by little.
+
+    Examples
+    --------
+    >>> stated = {"gyro_scale_ratio": (0.03, 0.02, 0.04)}
+    >>> [value_is_right(stated, {"gyro_scale_ratio": value}) for value in (0.021, 0.036, 0.05)]
+    [True, True, False]
+    """
+    near = VALUE_RATIO * max(map(abs, hidden.values()), default=0.0)
+    return all(
+        name in stated
+        and (stated[name][1] <= value <= stated[name][2] or abs(stated[name][0] - value) <= near)
+        for name, value in hidden.items()
+    )
+
+
+def outcome_of(
+    answer: Answer,
+    right: Sequence[str],
+    nearest: Sequence[str],
+    known: Sequence[str],
+    hidden: Mapping[str, float] | None = None,
+) -> Outcome:
+    """Return what an answer is worth, where what is ``known`` is no answer.
 
     Examples
     --------
@@ -101,12 +142,17 @@ def outcome_of(answer: Answer, right: Sequence[str], nearest: Sequence[str], kno
     sets = [names for names in answer.sets if good & {*names}]
     if single - good or len(sets) < len(answer.sets) or answer.faults or answer.refusal:
         return Outcome.COMPANY if single & good or sets else Outcome.WRONG
+    if single & {*right}:
+        return Outcome.RIGHT if value_is_right(answer.named, hidden or {}) else Outcome.VALUE
     if single:
-        return Outcome.RIGHT if single & {*right} else Outcome.NEAREST
+        return Outcome.NEAREST
     if sets:
         return Outcome.SET
-    stated = {*answer.unexplained, *answer.learned, *answer.candidates}
-    return Outcome.HONEST if stated - {*known} else Outcome.SILENT
+    if {*answer.unexplained, *answer.learned} - {*known}:
+        return Outcome.UNEXPLAINED
+    if candidates := {*answer.candidates} - {*known}:
+        return Outcome.CANDIDATE if candidates & good else Outcome.OTHER
+    return Outcome.SILENT
 
 
 class Examined(NamedTuple):
@@ -127,7 +173,13 @@ def asked(runs: Sequence[RunLog], robot: Robot) -> tuple[Answer, Robot]:
     diagnosis: Any = found.diagnosis
     terms = found.extended.learned[len(robot.learned) :]
     return Answer(
-        named=diagnosis.values,
+        named={
+            **{
+                e.parameter: (e.mean, e.mean - 2.0 * e.scatter, e.mean + 2.0 * e.scatter)
+                for e in diagnosis.varying
+            },
+            **{v.name: (v.value, v.low, v.high) for cause in diagnosis.built_in for v in cause.parameters},
+        },
         causes=tuple(cause.name for cause in diagnosis.causes),
         sets=diagnosis.ambiguous_sets,
         varying=tuple(each.name for each in diagnosis.varying),
@@ -243,12 +295,19 @@ def run_case(case: Case) -> ForeignTrial:
     rng, shown, size, over = np.random.default_rng(key), base.world, 0.0, 0.0
     right: tuple[str, ...] = ()
     nearest: tuple[str, ...] = ()
+    hidden: dict[str, float] = {}
     if case.effect:
         effect = effect_of(case.engine, case.world, case.effect)
         right, nearest = effect.right, effect.nearest
         size, over = sized(case.engine, case.world, case.seed, case.effect)
         size *= float(rng.choice([-1.0, 1.0])) if effect.signed else 1.0
         shown = effect.hide(base.world, size)
+        given = base.robot.effects  # a ratio is of what was calibrated
+        hidden = {
+            name: value * (1.0 + (given.get(name, 0.0) if PARAMETER[name].as_percent else 0.0))
+            for name, value in effect.values(base.world, size).items()
+            if name in parameters_of(base.robot.drive)
+        }
     runs = runs_of(shown, driven_by(base.world, N_RUNS, rng), np.random.SeedSequence(key))
     answer, _ = asked(runs, base.robot)
     return ForeignTrial(
@@ -262,8 +321,9 @@ def run_case(case: Case) -> ForeignTrial:
         inside=bool({*right} & {each.name for each in library_of(base.robot.drive)}),
         right=right,
         nearest=nearest,
+        hidden=hidden,
         known=base.known,
         answer=answer,
-        outcome=outcome_of(answer, right, nearest, base.known),
+        outcome=outcome_of(answer, right, nearest, base.known if case.effect else (), hidden),
         seconds=time.perf_counter() - start_s,
     )

@@ -8,7 +8,7 @@ stands beside each effect.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from studies.foreign import scenes, sensors
-from studies.foreign.physics import EVERY, SAMPLE_S, STEP_S, Body, integrate
+from studies.foreign.physics import EVERY, G_MPS2, SAMPLE_S, STEP_S, Body, integrate
 from studies.foreign.scenes import Recorded, Scene
 from studies.foreign.sensors import Motor, Sensing
 from terrain.records import Array, Label, RunLog, Stream
@@ -385,6 +385,8 @@ class ForeignEffect(NamedTuple):
     right: tuple[str, ...] = ()  #: names of the catalogue that are this effect
     nearest: tuple[str, ...] = ()  #: names that come nearest, no error
     engines: tuple[str, ...] = ("plain", "mujoco")
+    #: values by parameter that a right name has, over those of the world before; empty where its law is another
+    values: Callable[[World, float], Mapping[str, float]] = lambda world, size: {}
 
 
 def _changed(part: str, **change: Callable[[Any, float], Any]) -> Callable[[World, float], World]:
@@ -511,7 +513,67 @@ def _effects() -> Iterator[ForeignEffect]:
     yield each("gyro_cubic", _IMU, change, 0.15, True, ("gyro_nonlinearity",), ("gyro_scale",), _PLAIN)
 
 
-EFFECTS = tuple(_effects())
+# -- The values that right names have, beside those of the world before ------------------------------------
+
+
+def track_m(world: World) -> float:
+    """Return the effective track of a skid-steer world: the speed difference of its sides over its yaw rate."""
+    driven = driven_by(world, 4, np.random.default_rng(0))
+    square, product = 0.0, 0.0
+    for run in runs_of(world, driven, np.random.SeedSequence(0)):
+        wheels, imu = run.streams["wheels"], run.streams["imu"]
+        left, right = (wheels.channel(name) for name in load_robot(world.robot).rate_channels)
+        rate = np.interp(wheels.time_s, imu.time_s, imu.channel("gyro_z_radps"))
+        square, product = (
+            square + float((right - left) @ (right - left)),
+            product + float((right - left) @ rate),
+        )
+    return square / product
+
+
+def _track(world: World, size: float) -> dict[str, float]:
+    if world.name == "omni":
+        return {"wheel_distance_ratio": size}
+    apart = world._replace(body=world.body._replace(wheels_m=_apart(world.body, size)))
+    return {"effective_track_ratio": track_m(apart) / track_m(world) - 1.0}
+
+
+def _value(name: str, of: Callable[[World, float], float] = lambda world, size: size) -> Any:
+    return lambda world, size: {name: of(world, size)}
+
+
+_VALUES: dict[str, Callable[[World, float], Mapping[str, float]]] = {
+    "tyre_radius": _value("wheel_radius_ratio"),
+    "side_radius": _value("one_sided_radius_ratio"),
+    "wheel_worn": _value("wheel_scale_1_ratio"),
+    "wheels_apart": _track,
+    "payload": _value("payload_ratio"),
+    "soft_ground": _value("rolling_resistance_ratio"),
+    "weak_magnets": _value("motor_constant_ratio", lambda world, size: size / (1.0 - size)),
+    "gyro_scale": _value("gyro_scale_ratio"),
+    "imu_late": _value("imu_latency_s"),
+    "lidar_late": _value("camera_latency_s"),
+    "lidar_moved": lambda world, size: {"lever_x_m": 0.8 * size, "lever_y_m": -0.6 * size},
+    "lidar_turned": _value("camera_yaw_rad", lambda world, size: -size),
+    "steering_offset": lambda world, size: {
+        "steering_offset_front_rad" if world.name == "car" else "steering_offset_2_rad": size
+    },
+    "steering_late": _value("steering_delay_s"),
+    "steering_gain": _value("steering_gain_ratio"),
+    "gear": _value("wheel_radius_ratio"),
+    "bearings": _value(
+        "rolling_resistance_ratio",
+        lambda world, size: float((size / world.body.radius_m).sum()) / (world.body.mass_kg * G_MPS2),
+    ),
+    "wheels_askew": _value("steering_offset_front_rad"),
+    "steering_slack": _value("steering_backlash_rad"),
+    "imu_pitched": _value("accel_bias_mps2", lambda world, size: -G_MPS2 * math.sin(size)),
+    "gear_play": _value("drive_backlash_rad"),
+    "gear_backlash": _value("drive_backlash_rad"),
+    "gyro_cubic": _value("gyro_nonlinearity_s2"),
+}
+
+EFFECTS = tuple(effect._replace(values=_VALUES.get(effect.name, effect.values)) for effect in _effects())
 """One is of the catalogue where that of a robot's drive has a right name."""
 
 
