@@ -26,6 +26,7 @@ import numpy as np
 import yaml
 
 from terrain.angles import unwrapped
+from terrain.deviation import Deviation, deviation_lines
 from terrain.effects import (
     PARAMETER,
     SCHEMA,
@@ -443,8 +444,11 @@ def extended_yaml(
     source: str | Mapping[str, str],
     region: Region | None = None,
     learned: Sequence[LearnedTerm] = (),
+    deviation: Deviation | None = None,
 ) -> str:
-    """Return the description of a robot with a section ``effects``, and ``learned`` where there are terms, as YAML.
+    """Return the description of a robot with a section ``effects``, as YAML.
+
+    Where there are terms it has a section ``learned``, and ``deviation`` where that is known.
 
     Everything else is kept, comments included; earlier sections of these names are replaced.
 
@@ -456,6 +460,7 @@ def extended_yaml(
     source : of the numbers, in words; by parameter where they differ
     region : of driving, that they were validated in
     learned : terms that act beside the effects
+    deviation : of runs from the simulation of the extended robot
 
     Raises
     ------
@@ -503,7 +508,7 @@ def extended_yaml(
         }
         lines.append("  region:")
         lines += [f"    {n}: {_flow(e)}" for n, e in {**ranges, "terrains": [*region.terrains]}.items()]
-    lines += learned_lines(learned)
+    lines += [*learned_lines(learned), *deviation_lines(deviation)]
     text = _without_extension(path.read_text(encoding="utf-8-sig")) + "\n".join(lines) + "\n"
     try:
         content = parse_yaml(text)
@@ -519,7 +524,7 @@ def extended_yaml(
     return text
 
 
-EXTENSION = ("effects", "learned")  #: Sections that an extension writes.
+EXTENSION = ("effects", "learned", "deviation")  #: Sections that an extension writes.
 
 
 def _without_extension(text: str) -> str:

@@ -14,7 +14,8 @@ Geometry and mass are required of every robot; the sections ``body``, ``motors``
 robot showed beside its nominal figures: its effective track, the radius that its wheels roll on, delays.  The
 list ``filters`` names the filters and observers that apply, where not all of its drive do.  The section
 ``effects`` of an extended robot (:mod:`terrain.effects`) says what else acts, and the section ``learned``
-(:mod:`terrain.learned_term`) what acts without a name; :mod:`terrain.extension` makes use of both.
+(:mod:`terrain.learned_term`) what acts without a name; :mod:`terrain.extension` makes use of both.  The section
+``deviation`` (:mod:`terrain.deviation`) says how far runs are from its simulation.
 
 **The region of driving** that an extended robot was validated in is part of the section ``effects``; a range that was
 not measured is left out::
@@ -42,6 +43,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn, Self, Typ
 
 import numpy as np
 
+from terrain.deviation import Deviation, read_deviation
 from terrain.effects import read_effects
 from terrain.errors import ConfigError
 from terrain.files.documents import check_keys, is_number, numbers, read_yaml
@@ -330,6 +332,8 @@ class Robot(ABC):
     filters: tuple[str, ...] = ()
     #: what acts on it without a name, of :mod:`terrain.learned_term`
     learned: tuple[LearnedTerm, ...] = field(default=(), hash=False)
+    #: how far runs deviate from its simulation; None where that is not known
+    deviation: Deviation | None = field(default=None, hash=False)
 
     body: Body = field(init=False, repr=False, compare=False)  #: masses and tyres
     motors: Motors = field(init=False, repr=False, compare=False)  #: and their speed loop
@@ -916,7 +920,7 @@ def robot_from(file: str, described: Any) -> Robot:
     """Return the robot of a description's content; ``file`` is what messages call it."""
     drive = described.get("drive") if isinstance(described, dict) else None
     kind = KIND_OF_DRIVE.get(drive, SkidSteerRobot) if isinstance(drive, str) else SkidSteerRobot
-    optional = (*KIND_OF_SECTION, "identified", "filters", "effects", "learned")
+    optional = (*KIND_OF_SECTION, "identified", "filters", "effects", "learned", "deviation")
     check_keys(file, described, ["name", "drive", *kind.numbers], optional=optional)
     name = described["name"]
     if not isinstance(name, str) or not name:
@@ -950,5 +954,7 @@ def robot_from(file: str, described: Any) -> Robot:
         robot = replace(robot, effects=effects, effects_cov=cov, region=region)
     if "learned" in described:
         robot = replace(robot, learned=read_learned(f"{file}: learned", described["learned"]))
+    if "deviation" in described:
+        robot = replace(robot, deviation=read_deviation(f"{file}: deviation", described["deviation"]))
     robot.check_geometry(file)
     return robot

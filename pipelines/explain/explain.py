@@ -106,7 +106,7 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
     if result.extended_file is not None:
         effects = extended_effects(tested, result.diagnosis)
         sources, about = sources_of(result.diagnosis, settings.dataset or "a data set"), result.extended
-        text = extended_yaml(description, *effects, sources, about.region, about.learned)
+        text = extended_yaml(description, *effects, sources, about.region, about.learned, about.deviation)
         atomic_write(extended_file, text)
     if (drive := result.diagnosis.next_drive) is None:
         (out / NEXT_FILE).unlink(missing_ok=True)  # of an earlier result
@@ -196,7 +196,7 @@ def explain(
         source = f"terrain explain, {diagnosis.n_runs} runs of {data or 'a data set'}"
         terms = [replace(term, source=source) for term in diagnosed.with_terms.learned[len(robot.learned) :]]
         extended = replace(robot, effects=values, effects_cov=cov, region=region_of(diagnosed.fit, robot))
-        extended = replace(extended, learned=(*robot.learned, *terms))
+        extended = replace(extended, learned=(*robot.learned, *terms), deviation=diagnosed.deviation)
     return ExplainResult.of(
         asked,
         data=data,

@@ -48,6 +48,11 @@ class ComparedRun(NamedTuple):
         }
         return self._replace(**arrays, inputs={name: values[inside] for name, values in self.inputs.items()})
 
+    @property
+    def speed_mps(self) -> Array:
+        """Speed (m,) that the wheels roll, in any direction."""
+        return np.asarray(np.hypot(self.inputs["speed_mps"], self.inputs["sideways_mps"]))
+
     def residual(self, extended: bool) -> Array:
         """Return measured minus simulated (m, channels), by the extended simulation or the one before."""
         simulated = self.after if extended else self.before

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from terrain.deviation import Deviation
 from terrain.discrepancy.compared import ComparedRun, beside_extended, compare_runs, without_levels
 from terrain.discrepancy.constancy import PartValues, part_values, rogues_among
 from terrain.discrepancy.diagnose import check_ids, find_causes, judged, statement_of
-from terrain.discrepancy.earned import MIN_RUNS, crossed_runs, held_out_runs
+from terrain.discrepancy.earned import MIN_RUNS, crossed_runs, held_out_runs, units_of
 from terrain.discrepancy.gain import Gain
 from terrain.discrepancy.grounds import simulation_for
 from terrain.discrepancy.held_out import Comparison, filter_gain, repair_held_out, split_runs
@@ -25,6 +26,7 @@ from terrain.discrepancy.learner import (
     learned_gains,
     scatter_square,
 )
+from terrain.discrepancy.left_out import deviation_of, left_out_residuals
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.runs import (
     LowPass,
@@ -66,6 +68,7 @@ class DiagnosedRuns:
     #: runs judged, beside that; where none was held out, beside what was named
     whole: tuple[ComparedRun, ...]
     whole_gain: Gain  #: of that on them
+    deviation: Deviation  #: from that of runs that were left out of the fit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,7 +148,10 @@ def diagnose_runs(
             with_terms = last.with_learned(kept_terms(learned, gains))
             whole = beside(with_terms)
         whole_gain = on.gain(whole)
-    behind = {run.run_id for run in problem.signals}
+    behind, kept = {run.run_id for run in problem.signals}, with_terms.learned[len(last.learned) :]
+    fitted = compare_runs(simulation, with_terms, problem.signals, problem.low_pass)
+    built = {name: each for name, each in learned.items() if each.term in kept}
+    left = left_out_residuals(fitted, problem.signals, info, diagnosis.covariance.parameters, built)
     return DiagnosedRuns(
         diagnosis=diagnosis,
         simulation=simulation,
@@ -166,6 +172,7 @@ def diagnose_runs(
         with_terms=with_terms,
         whole=whole,
         whole_gain=whole_gain,
+        deviation=deviation_of(fitted, left, units_of(fitted), problem.low_pass),
     )
 
 

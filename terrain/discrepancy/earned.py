@@ -51,7 +51,7 @@ remove from the others all the same: a channel that is wrong by itself, as curre
 known, hardly speaks against a track that takes the error of three others."""
 
 
-def units_of(runs: Sequence[RunLog] | Sequence[Signals]) -> list[str]:
+def units_of(runs: Sequence[RunLog] | Sequence[Signals] | Sequence[ComparedRun]) -> list[str]:
     """Return by run what is held out as a whole: its session where two or more are named, else the run."""
     sessions = {run.session for run in runs} - {""}
     return [run.session if len(sessions) > 1 and run.session else run.run_id for run in runs]

@@ -38,7 +38,6 @@ from terrain.discrepancy.runs import (
     term_inputs,
     term_rows,
 )
-from terrain.discrepancy.verdict import Covariance
 from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
 from terrain.learned_term import (
     INPUTS,
@@ -137,7 +136,8 @@ class Learned(NamedTuple):
     inner_gain: float
     reference_gain: float  #: that the black-box reference removes there; NaN where there are too few runs
     left_std: float  #: beside the noise, of what is left there, in the channel's unit
-    noise_std: float  #: root mean square of the noise of these runs
+    #: by run (m,), what the term adds to its rows over what it would without the run's group
+    left_out: Mapping[str, Array]
 
 
 def learn_terms(
@@ -179,11 +179,12 @@ def learn_terms(
         shown = GYRO if channel == HEADING and HEADING not in measured else channel
         if shown not in measured or (channel == GYRO and HEADING not in measured):
             continue
-        products, grams = dictionary(every, channel), []
+        products, grams, rows = dictionary(every, channel), [], []
         if products not in known:
             known = {products: [columns_of(products, x, np.full(len(x), dt)) for dt, x in steps_inputs]}
         for run, columns, left in zip(runs, known[products], residuals, strict=True):
             seen = term_rows(run, simulation, low_pass, shown, channel, columns)
+            rows.append(seen)
             table = np.hstack([seen, left[:, [CHANNELS.index(shown)]]])
             table = table[np.isfinite(table).all(axis=1)]
             grams.append((table.T @ table, len(table)))
@@ -192,9 +193,10 @@ def learn_terms(
         n_rows = sum([n for _, n in grams])
         c = CHANNELS.index(shown)
         before = sum(float(np.nansum(run.residual(False)[:, c] ** 2)) for run in compared)
-        sums = sums[sums[:, -1, -1] > 0.0]
-        if len(sums) < MIN_GROUPS or not before > 0.0:
+        there = sums[:, -1, -1] > 0.0
+        if there.sum() < MIN_GROUPS or not before > 0.0:
             continue
+        group, sums = np.cumsum(there)[groups] - 1, sums[there]  # of a run without the channel, another's
         errors = cross_validated(sums)
         reference = float(references[c])
         n = size_of(errors, (1.0 - ENOUGH) * before + ENOUGH * reference)
@@ -203,7 +205,7 @@ def learn_terms(
         sizes = np.concatenate([noise.size(run.pace_mps)[:, c] for run in compared])
         noise_std = float(np.sqrt(np.nanmean(sizes**2)))
         left_std = math.sqrt(max(float(errors[:, n].sum()) / n_rows - noise_std**2, 0.0))
-        term = None
+        term, left_out = None, {}
         if n:
             total = sums.sum(axis=0)
             chosen = selected(total, n)
@@ -215,8 +217,11 @@ def learn_terms(
             term = replace(term, says=where_it_acts(channel, names, np.concatenate(added), every))
             simulation = simulation.with_learned([term])
             residuals = [left_by(simulation, run, low_pass) for run in runs]
+            without = [_weights(total - own, n) for own in sums]
+            change = [_weights(total, n) - each for each in without]
+            left_out = {run.run_id: seen @ change[g] for run, seen, g in zip(runs, rows, group, strict=True)}
         inner_gain, reference_gain = (1.0 - np.array([errors[:, n].sum(), reference]) / before).tolist()
-        learned[shown] = Learned(term, inner_gain, reference_gain, left_std, noise_std)
+        learned[shown] = Learned(term, inner_gain, reference_gain, left_std, left_out)
     return learned
 
 
@@ -231,46 +236,6 @@ def scatter_square(info: Evidence) -> Array:
     return np.asarray(
         sum([np.nansum((std * rows.sensitivity[info.nuisances]) ** 2, axis=(0, 1)) for rows in info.rows])
     )
-
-
-def replay_std(
-    run: Signals,
-    simulation: Simulation,
-    low_pass: LowPass,
-    noise: Noise,
-    covariance: Covariance,
-    learned: Mapping[str, Learned],
-) -> Array:
-    """Return the standard deviation (m, channels) of measured minus simulated, row by row.
-
-    It is that of the noise at the speed of the wheels, of the parameters, of the coefficients of learned terms, and of
-    what these leave beside the noise.
-
-    Parameters
-    ----------
-    simulation : with causes and terms built in
-    covariance : of the parameters of the causes
-    learned : by channel
-    """
-    about = simulation.planar_on(run.terrain), simulation.vector, covariance.parameters, low_pass
-    rows = rows_of(run, *about)
-    change = rows.sensitivity
-    size = noise.size(rows.pace_mps)
-    variance = size**2 + np.einsum("pmc,pq,qmc->mc", change, covariance.matrix, change)
-    dt, inputs = term_inputs(run, simulation, low_pass)
-    for shown, each in learned.items():
-        c = CHANNELS.index(shown)
-        variance[:, c] += (
-            each.left_std / each.noise_std * size[:, c]
-        ) ** 2  # it grows with speed as the noise
-        if each.term is None:
-            continue
-        columns = each.term.columns(inputs, np.full(len(inputs), dt))
-        for channel in {shown, GYRO} if each.term.channel == HEADING else {shown}:
-            seen = term_rows(run, simulation, low_pass, channel, each.term.channel, columns)
-            own = np.einsum("mk,kl,ml->m", seen, each.term.covariance, seen)
-            variance[:, CHANNELS.index(channel)] += np.maximum(own, 0.0)
-    return np.asarray(np.sqrt(variance))
 
 
 def kept_terms(learned: Mapping[str, Learned], gains: Sequence[LearnedGain] = ()) -> tuple[LearnedTerm, ...]:
@@ -423,6 +388,13 @@ def _coefficients(gram: Array, chosen: Sequence[int]) -> tuple[Array, Array]:
     own = gram[np.ix_(chosen, chosen)]
     inverse = np.linalg.inv(own + RIDGE * np.diag(own.diagonal()))
     return inverse @ gram[list(chosen), -1], inverse
+
+
+def _weights(gram: Array, n: int) -> Array:
+    """Return the coefficients (k,) of all products where the best ``n`` are selected; 0 of the others."""
+    weights, chosen = np.zeros(len(gram) - 1), selected(gram, n)
+    weights[chosen] = _coefficients(gram, chosen)[0]
+    return weights
 
 
 def fitted(sums: Array, chosen: Sequence[int]) -> tuple[Array, Array]:

@@ -23,19 +23,19 @@ from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Names, setting
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.tree import Column, Report, Table
-from terrain.discrepancy.compared import CHANNEL_WORDS, beside_extended
+from terrain.deviation import Deviation
+from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, beside_extended
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns
 from terrain.discrepancy.gain import HALF, gain_of
-from terrain.discrepancy.learner import ENOUGH, kept_terms, replay_std
+from terrain.discrepancy.learner import ENOUGH, kept_terms
 from terrain.effects import CHANNELS
 from terrain.errors import ConfigError, DataError
-from terrain.records import Label, RunLog
+from terrain.records import Array, Label, RunLog
 
 EXAMPLE = "python tests/studies real-sets --data ~/sets --sets marmotte,borealtc-SNOW"
 FOREIGN = "zork"  #: A label that is no soil
 ALL = "all"  #: Channels, in the place of one
 COVERS = 0.90, 0.98  #: Accepted coverage of a 95 % interval
-NORMAL_95 = 1.96  #: Half of such an interval, in standard deviations
 OTHER_THAN = {"grass": "asphalt"}  #: Another soil than that, grass of all others
 
 
@@ -115,7 +115,7 @@ class WholeRow(NamedTuple):
     gain: float  #: with those that are kept
     gain_ci: tuple[float, float]
     learner_gain: float
-    coverage: float  #: of the 95 % interval of the replay with all terms
+    coverage: float  #: of the 95 % interval of the replay with those that are kept
     says: str  #: of the term
 
 
@@ -181,24 +181,18 @@ def whole_rows(name: str, label: str, found: DiagnosedRuns) -> list[WholeRow]:
     every = kept_terms(found.learned)
     last = (found.extended or found.simulation).with_learned(every)
     beside = [beside_extended(run, own[run.run_id], last, found.low_pass) for run in judged]
-    about = last, found.low_pass, found.noise, found.diagnosis.covariance, found.learned
     nothing = [np.full_like(run.residual(True), 0.0) for run in beside]
     noise = {channel: of.noise for channel, of in found.diagnosis.residual_before.items()}
     of_all = gain_of(beside, nothing, noise, 0, gain.how) if beside else None
-    apart, std = (
-        np.concatenate([np.empty((0, len(CHANNELS))), *parts])
-        for parts in (
-            [run.residual(True) for run in beside],
-            [replay_std(own[run.run_id], *about) for run in beside],
-        )
-    )
+    held = {run.run_id for run in judged}
+    whole = [run for run in found.whole if run.run_id in held]
     says = {shown: each.term.says for shown, each in found.learned.items() if each.term is not None}
     rows = []
     for channel, of in gain.channels.items():
-        c = CHANNELS.index(channel)
-        known = np.isfinite(apart[:, c]) & np.isfinite(std[:, c])
-        inside = np.abs(apart[known, c]) <= NORMAL_95 * std[known, c]
-        covered = float(inside.mean()) if known.any() else np.nan
+        inside = np.concatenate(
+            [np.empty(0), *[covered_rows(run, found.deviation, channel) for run in whole]]
+        )
+        covered = float(inside.mean()) if inside.size else np.nan
         before = named.channels[channel].reduction if named and channel in named.channels else np.nan
         both = of_all.channels[channel].reduction if of_all and channel in of_all.channels else np.nan
         gains = before, both, of.reduction, of.ci, of.learner_reduction
@@ -207,6 +201,15 @@ def whole_rows(name: str, label: str, found: DiagnosedRuns) -> list[WholeRow]:
     both = of_all.reduction if of_all else np.nan
     gains = before, both, gain.reduction, gain.ci, gain.learner_reduction
     return [*rows, WholeRow(name, label, ALL, *gains, np.nan, "")]
+
+
+def covered_rows(run: ComparedRun, deviation: Deviation, channel: str) -> Array:
+    """Return of the rows of a run (k,) where a channel is known whether its 95 % interval covers them."""
+    if channel not in deviation.channels:
+        return np.empty(0)
+    residual = run.residual(True)[:, CHANNELS.index(channel)]
+    half = deviation.channels[channel].half_95(run.speed_mps, run.inputs["turn_mps"])
+    return np.asarray((np.abs(residual) <= half)[np.isfinite(residual)])
 
 
 def run(settings: Settings, progress: Progress = silent) -> RealSets:

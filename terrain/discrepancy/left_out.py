@@ -1,0 +1,118 @@
+"""How far runs deviate from an extended simulation that was fitted without them: see :mod:`terrain.deviation`.
+
+Runs behind a fit are nearer to it than others are.  Each run, or session where there are several, is left out of the
+fit in turn: the values of causes step to those that the others give, linearly, and terms are selected and fitted
+without it (:func:`terrain.discrepancy.learner.learn_terms`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.optimize import nnls
+
+from terrain.deviation import ChannelDeviation, Deviation
+from terrain.discrepancy.compared import ComparedRun
+from terrain.discrepancy.earned import units_of
+from terrain.discrepancy.evidence import Evidence
+from terrain.discrepancy.learner import Learned
+from terrain.discrepancy.runs import LowPass, Signals, measured_channels
+from terrain.effects import CHANNELS, GYRO, HEADING
+from terrain.records import Array
+
+COVERED = 0.95  #: Part of the rows of a further run that the band holds.
+MIN_UNITS = 3  #: Least number of runs, or sessions, that a deviation is estimated from.
+LEAST = (
+    0.02  #: Part of the mean square that a row weighs as in the fit, so that those at rest are not all of it.
+)
+N_FITS = 5  #: Of the fit by weights that follow from the one before.
+
+
+def left_out_residuals(
+    runs: Sequence[ComparedRun],
+    signals: Sequence[Signals],
+    info: Evidence,
+    names: Sequence[str],
+    learned: Mapping[str, Learned],
+) -> list[Array]:
+    """Return measured minus predicted (m, channels) of runs by fits without each of them.
+
+    Parameters
+    ----------
+    runs : beside the extended simulation, with all terms that are kept
+    signals : of the runs of the evidence, in its order
+    info : around the values of the causes that are built in
+    names : of their parameters
+    learned : by channel, terms that are kept
+    """
+    steps = {
+        run.run_id: step for run, step in zip(info.rows, _steps(info, names, units_of(signals)), strict=True)
+    }
+    change = {run.run_id: run.sensitivity[info.places(names)] for run in info.rows}
+    residuals = []
+    for run in runs:
+        left = run.residual(True) - np.tensordot(steps[run.run_id], change[run.run_id], axes=1)
+        for shown, each in learned.items():
+            if each.term is None or run.run_id not in each.left_out:
+                continue
+            for channel in {shown, GYRO} if each.term.channel == HEADING else {shown}:
+                left[:, CHANNELS.index(channel)] += each.left_out[run.run_id]
+        residuals.append(left)
+    return residuals
+
+
+def _steps(info: Evidence, names: Sequence[str], units: Sequence[str]) -> Array:
+    """Return the change (runs, k) of parameters by a fit without the unit of each run."""
+    a, g = info.clusters(info.places(names))
+    unit = np.sqrt(np.maximum(np.einsum("kii->i", a), 1e-30))
+    of, tiny = np.array(units), 1e-9 * np.eye(len(names))
+
+    def fitted(rest: Array) -> Array:
+        system = a[rest].sum(axis=0) / np.outer(unit, unit) + tiny
+        return np.asarray(np.linalg.solve(system, g[rest].sum(axis=0) / unit) / unit)
+
+    every = fitted(of == of)
+    without = {name: fitted(of != name) - every for name in dict.fromkeys(units)}
+    return np.array([without[name] for name in units])
+
+
+def deviation_of(
+    runs: Sequence[ComparedRun], left: Sequence[Array], units: Sequence[str], low_pass: LowPass
+) -> Deviation:
+    """Return the deviation of channels that were measured; without enough runs of a channel, of that none.
+
+    Parameters
+    ----------
+    left : (m, channels) of :func:`left_out_residuals` of each run
+    units : run or session by run
+    """
+    speed = np.concatenate([run.speed_mps for run in runs])
+    turn = np.concatenate([run.inputs["turn_mps"] for run in runs])
+    every, of = np.concatenate(left), np.repeat(units, [len(each) for each in left])
+    powers, channels = np.column_stack([np.ones_like(speed), speed**2, turn**2]), {}
+    for name in measured_channels(runs):
+        r = every[:, CHANNELS.index(name)]
+        known = np.isfinite(r)
+        n = len(np.unique(of[known]))
+        if n < MIN_UNITS or not r[known].any():
+            continue
+        stds = np.sqrt(_growth(powers[known], r[known] ** 2))
+        own = ChannelDeviation(float(stds[0]), float(stds[1]), float(stds[2]), 1.0, n)
+        ratio = np.abs(r[known]) / own.std(speed[known], turn[known])
+        channels[name] = own._replace(times_95=float(np.quantile(ratio, COVERED)))
+    return Deviation(low_pass.cutoff_hz, low_pass.rate_hz, channels)
+
+
+def _growth(powers: Array, square: Array) -> Array:
+    """Return the coefficients (k,), none negative, by which squares (m,) grow with powers (m, k).
+
+    Weights are those of squares whose scatter is as large as their mean.
+    """
+    mean = float(square.mean())
+    size = np.array([mean, *np.zeros(powers.shape[1] - 1)])
+    for _ in range(N_FITS):
+        weight = 1.0 / np.maximum(powers @ size, LEAST * mean)
+        size = nnls(powers * weight[:, None], square * weight)[0]
+        size[0] = max(size[0], LEAST * mean)
+    return size
