@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.optimize import nnls
+from scipy.special import ndtri
+from scipy.stats import t as student
 
 from terrain.deviation import ChannelDeviation, Deviation
 from terrain.discrepancy.compared import ComparedRun
@@ -22,10 +24,13 @@ from terrain.effects import CHANNELS, GYRO, HEADING
 from terrain.records import Array
 
 COVERED = 0.95  #: Part of the rows of a further run that the band holds.
+TAIL = 0.5 + 0.5 * COVERED  #: Probability up to its upper edge.
 MIN_UNITS = 3  #: Least number of runs, or sessions, that a deviation is estimated from.
 LEAST = (
     0.02  #: Part of the mean square that a row weighs as in the fit, so that those at rest are not all of it.
 )
+TINY = 1e-30  #: A square of nothing, by which is divided.
+MAX_FOLDS = 12  #: Parts of the runs that are left out in turn.
 N_FITS = 5  #: Of the fit by weights that follow from the one before.
 
 
@@ -97,11 +102,30 @@ def deviation_of(
         n = len(np.unique(of[known]))
         if n < MIN_UNITS or not r[known].any():
             continue
-        stds = np.sqrt(_growth(powers[known], r[known] ** 2))
-        own = ChannelDeviation(float(stds[0]), float(stds[1]), float(stds[2]), 1.0, n)
-        ratio = np.abs(r[known]) / own.std(speed[known], turn[known])
-        channels[name] = own._replace(times_95=float(np.quantile(ratio, COVERED)))
+        rest, per_speed, per_turn = np.sqrt(_growth(powers[known], r[known] ** 2)).tolist()
+        times_95 = _factor(powers[known], r[known], of[known])
+        channels[name] = ChannelDeviation(rest, per_speed, per_turn, times_95, n)
     return Deviation(low_pass.cutoff_hz, low_pass.rate_hz, channels)
+
+
+def _factor(powers: Array, r: Array, units: Array) -> float:
+    """Return half of the 95 % interval of residuals (m,) over their standard deviation, of units (m,) left out of it.
+
+    It is the quantile over all rows (cross-conformal: Vovk, Annals of Mathematics and Artificial Intelligence 2015),
+    times that of Student's t over a normal one.  Its degrees of freedom are those of the mean squares of units, as
+    they scatter (Satterthwaite, Biometrics Bulletin 1946): many where each unit shows the noise, as many as units where
+    each has an offset of its own.
+    """
+    names, of = np.unique(units, return_inverse=True)
+    ratio = np.empty_like(r)
+    for k in range(min(len(names), MAX_FOLDS)):
+        inside = of % MAX_FOLDS == k
+        size = _growth(powers[~inside], r[~inside] ** 2)
+        ratio[inside] = np.abs(r[inside]) / np.sqrt(powers[inside] @ size)
+    n, square = len(names), float(np.mean(ratio**2))
+    apart = np.bincount(of, weights=ratio**2 - square) / len(r)
+    freedom = max(2.0 * square**2 * (n - 1) / n / max(float(apart @ apart), TINY), 1.0)
+    return float(np.quantile(ratio, COVERED) * student.ppf(TAIL, freedom) / ndtri(TAIL))
 
 
 def _growth(powers: Array, square: Array) -> Array:
@@ -109,7 +133,7 @@ def _growth(powers: Array, square: Array) -> Array:
 
     Weights are those of squares whose scatter is as large as their mean.
     """
-    mean = float(square.mean())
+    mean = max(float(square.mean()), TINY)
     size = np.array([mean, *np.zeros(powers.shape[1] - 1)])
     for _ in range(N_FITS):
         weight = 1.0 / np.maximum(powers @ size, LEAST * mean)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import beta
 
 from pipelines.data.datasets import load_runs
 from pipelines.report.results import Progress, Result, described, silent
@@ -36,6 +37,7 @@ EXAMPLE = "python tests/studies real-sets --data ~/sets --sets marmotte,borealtc
 FOREIGN = "zork"  #: A label that is no soil
 ALL = "all"  #: Channels, in the place of one
 COVERS = 0.90, 0.98  #: Accepted coverage of a 95 % interval
+UNKNOWN = np.nan, (np.nan, np.nan)  #: What was not measured, and its interval
 OTHER_THAN = {"grass": "asphalt"}  #: Another soil than that, grass of all others
 
 
@@ -116,6 +118,7 @@ class WholeRow(NamedTuple):
     gain_ci: tuple[float, float]
     learner_gain: float
     coverage: float  #: of the 95 % interval of the replay with those that are kept
+    coverage_ci: tuple[float, float]  #: 95 % interval of that, by how runs differ
     says: str  #: of the term
 
 
@@ -189,18 +192,39 @@ def whole_rows(name: str, label: str, found: DiagnosedRuns) -> list[WholeRow]:
     says = {shown: each.term.says for shown, each in found.learned.items() if each.term is not None}
     rows = []
     for channel, of in gain.channels.items():
-        inside = np.concatenate(
-            [np.empty(0), *[covered_rows(run, found.deviation, channel) for run in whole]]
-        )
-        covered = float(inside.mean()) if inside.size else np.nan
+        covered = coverage_of([covered_rows(run, found.deviation, channel) for run in whole])
         before = named.channels[channel].reduction if named and channel in named.channels else np.nan
         both = of_all.channels[channel].reduction if of_all and channel in of_all.channels else np.nan
         gains = before, both, of.reduction, of.ci, of.learner_reduction
-        rows.append(WholeRow(name, label, channel, *gains, covered, says.get(channel, "")))
+        rows.append(WholeRow(name, label, channel, *gains, *covered, says.get(channel, "")))
     before = named.reduction if named else np.nan
     both = of_all.reduction if of_all else np.nan
     gains = before, both, gain.reduction, gain.ci, gain.learner_reduction
-    return [*rows, WholeRow(name, label, ALL, *gains, np.nan, "")]
+    return [*rows, WholeRow(name, label, ALL, *gains, *UNKNOWN, "")]
+
+
+def coverage_of(runs: Sequence[Array]) -> tuple[float, tuple[float, float]]:
+    """Return which part of the rows (k,) of runs is covered, and its 95 % interval, that of a binomial proportion.
+
+    It is of as many independent rows as the coverage scatters over runs, and of one a run at the least (Jeffreys'
+    interval: Brown, Cai and DasGupta, Statistical Science 2001).
+
+    Examples
+    --------
+    >>> runs = [np.arange(100) < n for n in (90, 95, 96, 99)]
+    >>> part, (low, high) = coverage_of(runs)
+    >>> part, round(low, 2), round(high, 2)
+    (0.95, 0.9, 0.98)
+    """
+    runs = [run for run in runs if run.size]
+    if not runs:
+        return UNKNOWN
+    rows, inside = np.array([(run.size, run.sum()) for run in runs]).T
+    part, n = float(inside.sum() / rows.sum()), len(runs)
+    square = float((((inside - part * rows) / rows.sum()) ** 2).sum()) * n / max(n - 1, 1)
+    n_rows = max(part * (1.0 - part) / square, n) if square > 0.0 else n
+    low, high = beta.ppf([0.025, 0.975], part * n_rows + 0.5, (1.0 - part) * n_rows + 0.5).tolist()
+    return part, (low, high)
 
 
 def covered_rows(run: ComparedRun, deviation: Deviation, channel: str) -> Array:
@@ -272,18 +296,20 @@ def report(result: RealSets) -> Report:
         Column("95 %", ".0%", of="gain_ci"),
         Column("learner", ".0%", of="learner_gain"),
         Column("covered", ".0%", of="coverage"),
+        Column("95 %", ".0%", of="coverage_ci"),
         Column("says", of="says", long=True),
     )
     there = [row for row in result.whole if row.channel == ALL and row.learner_gain > 0.0]
     worse = [row for row in result.whole if min(row.gain, row.all_gain) < 0.0]
     worse_by_term = [row for row in result.whole if row.says and row.all_gain < row.named_gain]
-    covered = [row.coverage for row in result.whole if np.isfinite(row.coverage)]
+    covered = [row for row in result.whole if np.isfinite(row.coverage)]
+    apart = [row for row in covered if row.coverage_ci[1] < COVERS[0] or row.coverage_ci[0] > COVERS[1]]
     of_terms = (
         f"With terms the gain is at least 90 % of the learner's in "
         f"{sum(row.gain >= ENOUGH * row.learner_gain for row in there)} of {len(there)} results; {len(worse)} of "
         f"{len(result.whole)} rows are worse than before, {len(worse_by_term)} by a term; intervals cover 90 "
-        f"to 98 % in "
-        f"{sum(COVERS[0] <= part <= COVERS[1] for part in covered)} of {len(covered)}."
+        f"to 98 % in {sum(COVERS[0] <= row.coverage <= COVERS[1] for row in covered)} of {len(covered)}, and in "
+        f"{len(apart)} the interval of that, by run, is outside."
     )
     parts = (Table(columns, result.rows, note=note), Table(of_whole, result.whole, note=of_terms))
     return Report("Measured sets under labels", answer, parts=parts)
