@@ -18,7 +18,7 @@ import numpy as np
 
 from terrain.discrepancy import constancy, verdict
 from terrain.discrepancy.clocks import latencies_of, shifts_of
-from terrain.discrepancy.earned import MIN_RUNS, HeldOut, Judgement, crossed_runs, judge
+from terrain.discrepancy.earned import MIN_RUNS, OUTWEIGHS, HeldOut, Judgement, crossed_runs, judge
 from terrain.discrepancy.evidence import EXCITED_RATIO, Z_EFFECT, Evidence, move_point, partial_information
 from terrain.discrepancy.gain import THIRDS
 from terrain.discrepancy.health.fault import Fault, repaired
@@ -470,7 +470,8 @@ from 0, is no value: the search would have gone on."""
 
 WORSE_RATIO = 1.1
 """A cause is withdrawn that makes the square of a channel larger by more than that, if what it changes there itself
-can make half of the rise: the rest is of the causes that were fitted with it."""
+can make half of the rise: the rest is of the causes that were fitted with it.  What it removes from other channels may
+outweigh that, as on data held out (:data:`terrain.discrepancy.earned.OUTWEIGHS`)."""
 
 PROBE_RATIO, PROBE_ALIKE = 0.5, 0.3
 """A cause is withdrawn if an input of its channel gains that ratio of its own gain beside it, and looks like
@@ -547,9 +548,11 @@ def reasons_to_withdraw(
             weights = np.zeros((1, len(fit.info.names)))
             weights[0, _own_and_base(fit, cause)[0]] = fit.change[at]
             acts = dict(zip(CHANNELS, fit.info.channel_power(weights).tolist(), strict=True))
+            net = sum([without - with_cause for without, with_cause, _ in effects.values()])
             for name, (without, with_cause, _) in reversed(effects.items()):
-                most = acts[name] + 2.0 * math.sqrt(acts[name] * without)
-                if with_cause > WORSE_RATIO * without and most > 0.5 * (with_cause - without):
+                most, rise = acts[name] + 2.0 * math.sqrt(acts[name] * without), with_cause - without
+                outweighed = net + rise > OUTWEIGHS * rise
+                if with_cause > WORSE_RATIO * without and most > 0.5 * rise and not outweighed:
                     reason = f"it makes {name} worse, by {with_cause / without - 1.0:.0%} of the square"
         size, var = fit.change[at], np.maximum(np.diag(slow_cov - fit.cov)[at], 0.0)
         least = SLOW_Z * np.sqrt(var * fit.tests[cause.name].inflation), SLOW_RATIO * np.linalg.norm(size)

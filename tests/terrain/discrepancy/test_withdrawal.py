@@ -103,6 +103,8 @@ def test_an_input_that_gains_much_beside_it_and_looks_like_it(yaw):
         ((1000.0, 900.0, 50.0), (1000.0, 1110.0, -90.0), ""),  # it does nothing there itself
         ((1000.0, 1110.0, 50.0), (1000.0, 900.0, 90.0), "speed_y_mps worse, by 11%"),
         ((1000.0, 1090.0, 50.0), (1000.0, 900.0, 90.0), ""),
+        ((1000.0, 1110.0, 50.0), (5000.0, 4000.0, 90.0), "speed_y_mps worse, by 11%"),
+        ((1000.0, 1110.0, 50.0), (5000.0, 3800.0, 90.0), ""),  # ten times that goes with it elsewhere
         ((1000.0, 1010.0, -5.0), (1000.0, 500.0, 90.0), "nothing in speed_y_mps, its"),
     ],
 )
