@@ -133,11 +133,11 @@ def report(result: ExplainResult) -> Report:
     held_out = f"{len(runs.held_out)} more held out to check them" if runs.held_out else ""
     lead = f"{diagnosis.n_runs} runs to find causes", held_out, result.data, result.terrain
     picture = None
-    if shown := runs.whole or runs.compared:  # held-out runs where there are any
+    if shown := runs.whole if runs.held_out else runs.compared:
         stretch = example_stretch(shown, runs.noise)
         there = measured_channels([stretch])
         of = [each.channel for each in channels_that_matter(result) if each.channel in there]
-        picture = figures.run_figure(stretch, runs.noise, (of or there)[:1])
+        picture = figures.run_figure(stretch, runs.deviation, (of or there)[:1])
     answer = answer_of(result)
     if result.against is not None:
         answer = f"{against_text(result.against, result.against_data or 'the other runs')} {answer}"
@@ -477,10 +477,10 @@ def _details(result: ExplainResult) -> Iterator[Section]:
         stated = [*map(Text, powertrain.sentences), Text(given, "note")]
         yield Section("From commanded to measured wheel speeds", stated)
     yield Section("What the residuals depend on", [*_dependence_parts(runs)])
-    whole: Sequence[ComparedRun] = [*runs.compared, *(runs.judged if runs.held_out else ())]
+    whole: Sequence[ComparedRun] = [*runs.compared, *(runs.whole if runs.held_out else ())]
     if result.n_pictures is not None:
         whole = telling_runs(whole, runs.noise, result.n_pictures)
-    drawn = [figures.run_figure(run, runs.noise, measured_channels([run])) for run in whole]
+    drawn = [figures.run_figure(run, runs.deviation, measured_channels([run])) for run in whole]
     yield Section("Whole runs", drawn)
     limits = []
     for limit in diagnosis.detection_limits:

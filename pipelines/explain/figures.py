@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
+from terrain.deviation import Deviation
 from terrain.discrepancy.compared import (
     CHANNEL_WORDS,
     INPUT_LABELS,
@@ -25,34 +26,32 @@ from terrain.discrepancy.runs import measured_channels
 from terrain.effects import CHANNELS
 from terrain.records import Array
 
-BAND_STDS = 2.0  #: Half width of the noise band in standard deviations
-
+BAND = "95 % of a further run"
 MEASURED, BEFORE, AFTER = "measured", "simulated", "extended"
 BLUE, VERMILION, GREY = 0, 1, 6
 AXIS = "{} [{}]"  #: Of what a channel is called, and its unit
 LEAST_POWER = 1e-300  #: Under the logarithm of a spectrum
 
 
-def run_figure(run: ComparedRun, noise: Noise, channels: Sequence[str]) -> Figure:
-    """Return channels of a run as measured and simulated, a panel each, the noise about the measurement."""
-    bands = BAND_STDS * noise.size(run.pace_mps)
-    panels = []
+def run_figure(run: ComparedRun, deviation: Deviation, channels: Sequence[str]) -> Figure:
+    """Return channels of a run as measured and simulated, a panel each, the band of the last simulation about it."""
+    panels, colour = [], VERMILION if run.after is None else BLUE
     for name in channels:
-        c = CHANNELS.index(name)
-        measured, band = run.measured[:, c], bands[:, c]
-        marks: list[Mark] = [
-            Band("noise, 95 %", run.time_s, measured - band, measured + band, GREY),
-            Line(MEASURED, run.time_s, measured, GREY),
-            Line(BEFORE, run.time_s, run.before[:, c], VERMILION),
-        ]
+        c, last, marks = CHANNELS.index(name), run.simulated[:, CHANNELS.index(name)], []
+        if name in deviation.channels:
+            half = deviation.channels[name].half_95(run.speed_mps, run.inputs["turn_mps"])
+            marks.append(Band(BAND, run.time_s, last - half, last + half, colour))
+        marks.append(Line(MEASURED, run.time_s, run.measured[:, c], GREY))
+        marks.append(Line(BEFORE, run.time_s, run.before[:, c], VERMILION))
         if run.after is not None:
-            marks.append(Line(AFTER, run.time_s, run.after[:, c], BLUE))
+            marks.append(Line(AFTER, run.time_s, last, BLUE))
         panels.append(Panel(marks, AXIS.format(*CHANNEL_WORDS[name])))
     held_out = ", held out of the diagnosis" if run.held_out else ""
     title = f"{run.run_id}{f', {run.terrain}' if run.terrain else ''}{held_out}"
     caption = (
-        "The prediction of the simulation from the logged wheels, steering and tilt, beside the measurement; "
-        "the band about it holds 95 % of the noise alone, without offsets. All have passed the same low-pass."
+        f"The prediction of the simulation from the logged wheels, steering and tilt, beside the measurement; "
+        f"the band about {BEFORE if run.after is None else AFTER} is to hold 95 % of a run that it was not fitted to, "
+        "by the runs behind it. All have passed the same low-pass."
     )
     return Figure(title, panels, caption, x_label="time in the run [s]")
 

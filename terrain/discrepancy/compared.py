@@ -53,6 +53,11 @@ class ComparedRun(NamedTuple):
         """Speed (m,) that the wheels roll, in any direction."""
         return np.asarray(np.hypot(self.inputs["speed_mps"], self.inputs["sideways_mps"]))
 
+    @property
+    def simulated(self) -> Array:
+        """Prediction (m, channels) of the extended simulation, or of the one before where nothing was built in."""
+        return self.before if self.after is None else self.after
+
     def residual(self, extended: bool) -> Array:
         """Return measured minus simulated (m, channels), by the extended simulation or the one before."""
         simulated = self.after if extended else self.before

@@ -56,7 +56,9 @@ class DiagnosedRuns:
     fit: tuple[RunLog, ...]  #: behind the diagnosis
     used: tuple[RunLog, ...]  #: these and those excluded from it
     held_out: tuple[RunLog, ...]
-    compared: tuple[ComparedRun, ...]  #: fit runs beside the simulation
+    compared: tuple[
+        ComparedRun, ...
+    ]  #: fit runs beside the simulation, and that with what was named and learned
     judged: tuple[ComparedRun, ...]  #: runs held out, or left out in turn, beside the simulation
     noise: Noise  #: of the fit runs
     low_pass: LowPass
@@ -149,9 +151,10 @@ def diagnose_runs(
             whole = beside(with_terms)
         whole_gain = on.gain(whole)
     behind, kept = {run.run_id for run in problem.signals}, with_terms.learned[len(last.learned) :]
-    fitted = compare_runs(simulation, with_terms, problem.signals, problem.low_pass)
+    extension = None if with_terms is simulation else with_terms
+    compared = compare_runs(simulation, extension, problem.signals, problem.low_pass)
     built = {name: each for name, each in learned.items() if each.term in kept}
-    left = left_out_residuals(fitted, problem.signals, info, diagnosis.covariance.parameters, built)
+    left = left_out_residuals(compared, problem.signals, info, diagnosis.covariance.parameters, built)
     return DiagnosedRuns(
         diagnosis=diagnosis,
         simulation=simulation,
@@ -172,7 +175,7 @@ def diagnose_runs(
         with_terms=with_terms,
         whole=whole,
         whole_gain=whole_gain,
-        deviation=deviation_of(fitted, left, units_of(fitted), problem.low_pass),
+        deviation=deviation_of(compared, left, units_of(compared), problem.low_pass),
     )
 
 

@@ -57,7 +57,7 @@ def left_out_residuals(
     change = {run.run_id: run.sensitivity[info.places(names)] for run in info.rows}
     residuals = []
     for run in runs:
-        left = run.residual(True) - np.tensordot(steps[run.run_id], change[run.run_id], axes=1)
+        left = run.measured - run.simulated - np.tensordot(steps[run.run_id], change[run.run_id], axes=1)
         for shown, each in learned.items():
             if each.term is None or run.run_id not in each.left_out:
                 continue

@@ -231,7 +231,7 @@ def covered_rows(run: ComparedRun, deviation: Deviation, channel: str) -> Array:
     """Return of the rows of a run (k,) where a channel is known whether its 95 % interval covers them."""
     if channel not in deviation.channels:
         return np.empty(0)
-    residual = run.residual(True)[:, CHANNELS.index(channel)]
+    residual = (run.measured - run.simulated)[:, CHANNELS.index(channel)]
     half = deviation.channels[channel].half_95(run.speed_mps, run.inputs["turn_mps"])
     return np.asarray((np.abs(residual) <= half)[np.isfinite(residual)])
 

@@ -207,13 +207,14 @@ def test_robots_on_tracks_have_sprockets(explained):
     assert "wheel" not in text.partition("Where these numbers")[0]
 
 
-def test_figures_show_the_residual_before_and_after_with_the_noise_about_the_measurement(few):
+def test_figures_show_the_residual_before_and_after_with_the_band_about_the_extended_robot(few):
     """The hidden camera yaw shows in the sideways speed, and is gone with the cause built in."""
     runs, noise, name = few.diagnosed.compared, few.diagnosed.noise, "speed_y_mps"
-    band, measured, before, after = run_figure(runs[0], noise, [name]).panels[0].marks
+    band, measured, before, after = run_figure(runs[0], few.diagnosed.deviation, [name]).panels[0].marks
     half = (np.asarray(band.high) - np.asarray(band.low)) / 2
     errors = [np.nanstd(np.asarray(each.y) - np.asarray(measured.y)) for each in (before, after)]
     assert errors[1] < np.nanmean(half) < errors[0]
+    np.testing.assert_allclose(np.asarray(band.high) + np.asarray(band.low), 2.0 * np.asarray(after.y))
     strongest, every = dependence_figures(runs, noise)
     place = measured_channels(runs).index(name)
     for panel in (strongest.panels[place], every[place].panels[0]):
