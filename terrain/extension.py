@@ -445,6 +445,7 @@ def extended_yaml(
     region: Region | None = None,
     learned: Sequence[LearnedTerm] = (),
     deviation: Deviation | None = None,
+    watch: Sequence[str] = (),
 ) -> str:
     """Return the description of a robot with a section ``effects``, as YAML.
 
@@ -461,6 +462,7 @@ def extended_yaml(
     region : of driving, that they were validated in
     learned : terms that act beside the effects
     deviation : of runs from the simulation of the extended robot
+    watch : lines of the section by which the robot is watched (:func:`terrain.discrepancy.watch.watch_lines`)
 
     Raises
     ------
@@ -508,7 +510,7 @@ def extended_yaml(
         }
         lines.append("  region:")
         lines += [f"    {n}: {_flow(e)}" for n, e in {**ranges, "terrains": [*region.terrains]}.items()]
-    lines += [*learned_lines(learned), *deviation_lines(deviation)]
+    lines += [*learned_lines(learned), *deviation_lines(deviation), *watch]
     text = _without_extension(path.read_text(encoding="utf-8-sig")) + "\n".join(lines) + "\n"
     try:
         content = parse_yaml(text)
@@ -524,7 +526,7 @@ def extended_yaml(
     return text
 
 
-EXTENSION = ("effects", "learned", "deviation")  #: Sections that an extension writes.
+EXTENSION = ("effects", "learned", "deviation", "watch")  #: Sections that an extension writes.
 
 
 def _without_extension(text: str) -> str:

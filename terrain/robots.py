@@ -15,7 +15,8 @@ robot showed beside its nominal figures: its effective track, the radius that it
 list ``filters`` names the filters and observers that apply, where not all of its drive do.  The section
 ``effects`` of an extended robot (:mod:`terrain.effects`) says what else acts, and the section ``learned``
 (:mod:`terrain.learned_term`) what acts without a name; :mod:`terrain.extension` makes use of both.  The section
-``deviation`` (:mod:`terrain.deviation`) says how far runs are from its simulation.
+``deviation`` (:mod:`terrain.deviation`) says how far runs are from its simulation, and ``watch``
+(:mod:`terrain.discrepancy.watch`) how far some seconds of them are.
 
 **The region of driving** that an extended robot was validated in is part of the section ``effects``; a range that was
 not measured is left out::
@@ -920,7 +921,7 @@ def robot_from(file: str, described: Any) -> Robot:
     """Return the robot of a description's content; ``file`` is what messages call it."""
     drive = described.get("drive") if isinstance(described, dict) else None
     kind = KIND_OF_DRIVE.get(drive, SkidSteerRobot) if isinstance(drive, str) else SkidSteerRobot
-    optional = (*KIND_OF_SECTION, "identified", "filters", "effects", "learned", "deviation")
+    optional = (*KIND_OF_SECTION, "identified", "filters", "effects", "learned", "deviation", "watch")
     check_keys(file, described, ["name", "drive", *kind.numbers], optional=optional)
     name = described["name"]
     if not isinstance(name, str) or not name:

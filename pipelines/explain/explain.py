@@ -57,6 +57,8 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
     from pipelines.explain.statements import sources_of
     from terrain.discrepancy.diagnosed_runs import extended_effects
     from terrain.discrepancy.next_drive import NEXT_FILE, commands_of, next_command
+    from terrain.discrepancy.runs import in_order
+    from terrain.discrepancy.watch import watch_lines, watched_on
     from terrain.extension import extended_yaml
     from terrain.files.atomic import atomic_write, ensure_writable
     from terrain.robots import load_robot
@@ -106,7 +108,14 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
     if result.extended_file is not None:
         effects = extended_effects(tested, result.diagnosis)
         sources, about = sources_of(result.diagnosis, settings.dataset or "a data set"), result.extended
-        text = extended_yaml(description, *effects, sources, about.region, about.learned, about.deviation)
+        judged = {run.run_id for run in result.diagnosed.judged}
+        held_out = [run for run in result.diagnosed.held_out if run.run_id in judged]
+        quiet = in_order([*result.diagnosed.fit, *held_out])
+        of = f"terrain explain, {len(quiet)} runs of {settings.dataset or 'a data set'}"
+        watched = watched_on(quiet, about, f"{of}, {len(held_out)} of them held out")
+        text = extended_yaml(
+            description, *effects, sources, about.region, about.learned, about.deviation, watch_lines(watched)
+        )
         atomic_write(extended_file, text)
     if (drive := result.diagnosis.next_drive) is None:
         (out / NEXT_FILE).unlink(missing_ok=True)  # of an earlier result

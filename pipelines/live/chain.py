@@ -20,6 +20,7 @@ from terrain.control.robot_control import check_table
 from terrain.control.slip_table import SlipTable
 from terrain.control.switching import (
     NO_BELIEF,
+    SWITCHING,
     OutputStatus,
     SwitchSettings,
     TerrainBelief,
@@ -197,3 +198,17 @@ class Chain:
     @property
     def _session(self) -> tuple[Filter | None, str]:
         return (None, "") if self._filter is None else (self._filter.filter, self._filter.name)
+
+
+class OnlyWatched(Chain):
+    """Of a robot that is watched, without a model of the terrain: it gives neither terrain nor commands."""
+
+    name = "watch"
+
+    def __init__(self, robot_name: str, table: SlipTable) -> None:
+        super().__init__(robot_name, table, SWITCHING, ClockWatch())
+        self.source = TerrainSource()
+
+    def take(self, sample: Sample) -> Step:
+        """Take a sample; nothing is made of it."""
+        return Step()

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationInfo, field_validator
 
-from pipelines.live.chain import COMMAND_VALID_S, Chain, CommandStatus, Step
+from pipelines.live.chain import COMMAND_VALID_S, Chain, CommandStatus, OnlyWatched, Step
 from pipelines.live.classifying import Classifier
 from pipelines.live.model import TerrainModel
 from pipelines.live.observer import Observer
@@ -26,6 +26,7 @@ from pipelines.live.recording import RecordingThread, SessionRecorder
 from terrain.control.live_state import LiveState
 from terrain.control.robot_control import PilotSettings
 from terrain.control.slip_table import SlipTable
+from terrain.discrepancy.watch import FALSE_ALARM_H, Watch, Watched
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.clocks import Inbox, SessionClock, numbers
 from terrain.estimation.live import LiveEstimate
@@ -134,6 +135,7 @@ class RobotSession:
     robot : its description; None for a robot that has none
     thread : that classifies its windows; at once without one
     leave : called with a code and a sentence where the robot cannot be served any longer
+    watched, false_alarm_h : robot that is watched where it is this one, and hours to a false alarm
 
     Attributes
     ----------
@@ -161,15 +163,21 @@ class RobotSession:
         robot: Robot | None,
         thread: ThreadPoolExecutor | None = None,
         leave: Callable[[str, str], None] = lambda code, sentence: None,
+        watched: Watched | None = None,
+        false_alarm_h: float = FALSE_ALARM_H,
     ) -> None:
         self.hello, self.served, self.leave = hello, served, leave
+        self.watch: Watch | None = None
+        if watched is not None and watched.robot.name == hello.robot:
+            self.watch = Watch(watched, hello.streams, false_alarm_h, thread)
         self.inbox = Inbox(hello.streams)
         pilot = PilotSettings(follows=hello.follows) if hello.control else None
         if pilot is not None and robot is None:
             raise ConfigError(
                 f"robot {hello.robot!r} has no description here: commands cannot be given to it"
             )
-        self.chain = chain_of(robot, hello.streams, self._model_of(served), served.table, pilot, thread)
+        about = self._model_of(served), served.table, pilot, thread, self.watch is not None
+        self.chain = chain_of(robot, hello.streams, *about)
         self._wheels = () if robot is None else robot.wheels
         self._clock = SessionClock()
         self._twist, self._twist_s = _NO_TWIST, -math.inf
@@ -307,6 +315,8 @@ class RobotSession:
         fresh = now_s - self._twist_s <= TWIST_FRESH_S
         twist = self._twist if fresh else _NO_TWIST
         done = self.chain.take(Sample(time_s, twist, readings))
+        if self.watch is not None:
+            self.watch.step(readings)
         self._n_steps += 1
         if done.windows or self.served.model is None or math.isnan(self._window_s):
             self._window_s = now_s
@@ -359,6 +369,7 @@ class RobotSession:
             "sensors": sensors,
             "served": self.served.number,
             "late": self.late or None,
+            "watch": None if self.watch is None else self.watch.content(),
         }
 
 
@@ -369,10 +380,16 @@ def chain_of(
     table: SlipTable,
     pilot: PilotSettings | None = None,
     thread: ThreadPoolExecutor | None = None,
+    watched: bool = False,
 ) -> Chain:
-    """Return what the samples of a robot go through: a pilot of these settings, without them an observer."""
+    """Return what the samples of a robot go through: a pilot of these settings, without them an observer.
+
+    A robot that is watched needs no model.
+    """
     if pilot is not None and robot is not None:
         return LivePilot(robot, table, Classifier(model, robot, thread), pilot, channels=channels)
+    if model is None and watched:
+        return OnlyWatched("" if robot is None else robot.name, table)
     if model is None:
         raise DataError("no model is served: only a robot that asks for commands can be served")
     return Observer(model, table, robot, channels, thread=thread)

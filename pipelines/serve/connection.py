@@ -27,6 +27,7 @@ from pipelines.serve.guard import bearer
 from pipelines.serve.hub import Hub
 from pipelines.serve.serve import LONGEST_TOKEN
 from pipelines.serve.wire import WireError, decode, encode
+from terrain.discrepancy.watch import Watch
 from terrain.estimation.clocks import number
 from terrain.files.documents import first_fault
 
@@ -278,6 +279,8 @@ class Connection:
         self._hub.trouble.pop(f"late samples of {name}", None)
         if late:
             self._hub.trouble[f"late samples of {name}"] = late
+        if (watch := self._session.watch) is not None:
+            self._report(name, watch)
         for window in output.windows:
             metrics.window_s.observe(window.took_s)
             metrics.windows.labels(window.terrain or "refused").inc()
@@ -285,6 +288,19 @@ class Connection:
             metrics.unsent.inc()
         self._step = output
         self._changed.set()
+
+    def _report(self, name: str, watch: Watch) -> None:
+        """Name in the log what a watched robot departs in from now on, or no more, and in trouble what is not over."""
+        for sentence in watch.news:
+            print(f"{name}: {sentence}", file=sys.stderr, flush=True)
+        for alarm in watch.raised:
+            self._hub.metrics.alarms.labels(alarm.channel).inc()
+        self._hub.metrics.departing.labels(name).set(len(watch.current))
+        self._hub.trouble.pop(f"watch of {name}", None)
+        if watch.current:
+            self._hub.trouble[f"watch of {name}"] = (
+                f"{name} {'; '.join([alarm.text for alarm in watch.current])}"
+            )
 
     async def _send(self) -> None:
         """Send what is there, first the notes, then the newest step; end with a fatal note."""

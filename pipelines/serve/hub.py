@@ -24,6 +24,7 @@ from pipelines.serve.serve import Settings, loaded, required_token
 from pipelines.serve.wire import WireError
 from terrain.control.live_state import LiveState, load_state, to_text
 from terrain.control.slip_table import SlipTable, load_slip_table
+from terrain.discrepancy.watch import read_watched
 from terrain.errors import ConfigError, DataError, LogError, TerrainError
 from terrain.estimation.live import CHANNELS
 from terrain.files.atomic import atomic_write, ensure_writable
@@ -76,8 +77,9 @@ class Hub:
     """
 
     def __init__(self, settings: Settings) -> None:
-        if settings.model is None:
+        if settings.model is None and settings.watch is None:
             raise ConfigError("--model is missing: models:/NAME@champion, models:/NAME/3, or a model folder")
+        self._watched = None if settings.watch is None else read_watched(settings.watch)
         self.settings, self._token = settings, required_token(settings)
         self._given = None if settings.robot is None else load_robot(settings.robot)
         table = load_slip_table(settings.table, None if self._given is None else self._given.name)
@@ -86,9 +88,9 @@ class Hub:
                 ensure_writable(folder)
                 folder.mkdir(parents=True, exist_ok=True)
         model = loaded(settings, settings.model)
-        assert model is not None
-        warm_up(model, self._given)
-        self.served = Served(1, model, settings.model, table)
+        if model is not None:
+            warm_up(model, self._given)
+        self.served = Served(1, model, settings.model or "", table)
         self.limits, self.metrics = Limits(sessions=settings.max_sessions), Metrics()
         self.metrics.served.set(1)
         self.sessions: dict[str, RobotSession] = {}
@@ -112,7 +114,10 @@ class Hub:
     def robot(self, name: str) -> Robot | None:
         """Return the description of a robot by its name, never by a path; None where it has none."""
         try:
-            return robot_named(name, self._given)
+            given = self._given
+            if self._watched is not None and (given is None or given.name != name):
+                given = self._watched.robot
+            return robot_named(name, given)
         except ConfigError:
             return None
 
@@ -152,7 +157,8 @@ class Hub:
         return opened
 
     def _begin(self, hello: Hello, leave: Callable[[str, str], None]) -> RobotSession:
-        opened = RobotSession(hello, self.served, self.robot(hello.robot), self._thread, leave)
+        about = hello, self.served, self.robot(hello.robot), self._thread, leave
+        opened = RobotSession(*about, self._watched, self.settings.false_alarm_h)
         state = self._left.get(hello.session)
         if state is None and self.settings.state is not None:
             try:
@@ -169,7 +175,9 @@ class Hub:
         if self.sessions.get(name) is not opened:
             return
         del self.sessions[name]
-        self.trouble.pop(f"late samples of {name}", None)
+        for trouble in (f"late samples of {name}", f"watch of {name}"):
+            self.trouble.pop(trouble, None)
+        self.metrics.forget(name)
         opened.end()
         self.metrics.sessions.set(len(self.sessions))
         self._left[name] = opened.state()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -34,6 +35,10 @@ class Metrics:
         self.windows = counter("windows", "Windows classified, by terrain.", ["terrain"])
         self.unsent = counter("unsent_steps", "Steps that a newer one replaced before they were read.")
         self.opened = counter("opened_sessions", "Sessions that were opened.")
+        self.alarms = counter(
+            "watch_alarms", "Departures of robots from their models, by channel.", ["channel"]
+        )
+        self.departing = gauge("watch_departures", "Departures that are not over.", ["session"])
         self.sessions = gauge("sessions", "Robots connected.")
         self.served = gauge("served_number", "Number of model and table.")
         self.step_s = histogram("step_seconds", "One step.", buckets=STEP_BUCKETS_S)
@@ -41,6 +46,11 @@ class Metrics:
         self.latency_s = histogram(
             "latency_seconds", "From the arrival of the newest sample to the end of the step."
         )
+
+    def forget(self, session: str) -> None:
+        """Leave out the figures of a session that has ended."""
+        with suppress(KeyError):
+            self.departing.remove(session)
 
     def totals(self) -> dict[str, int]:
         """Return what was counted so far of sessions, messages, rows, steps, errors and wrong tokens."""

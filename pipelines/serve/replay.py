@@ -20,13 +20,16 @@ from pipelines.live.chain import Chain
 from pipelines.live.model import TerrainModel
 from pipelines.live.session import chain_of
 from pipelines.live.windows import needs_filter
-from pipelines.report.figure import Figure, Panel, Strip
+from pipelines.report.figure import Figure, Line, Panel, Strip
 from pipelines.report.numbers import format_counts, format_value, plural
 from pipelines.report.results import Progress, Result, described, silent
-from pipelines.report.tree import Column, Report, Table, Text, sections
+from pipelines.report.tree import Column, Part, Report, Table, Text, sections
 from pipelines.serve.serve import Settings, loaded, stopping
 from terrain.control.robot_control import PilotSettings, check_table
 from terrain.control.slip_table import SlipTable, load_slip_table
+from terrain.discrepancy.compared import CHANNEL_WORDS
+from terrain.discrepancy.runs import in_order
+from terrain.discrepancy.watch import BLOCK_S, Alarm, Watch, read_watched
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live import CHANNELS
 from terrain.files.names import printable
@@ -121,6 +124,16 @@ class ReplayedRun(Replayed):
     windows: tuple[ObservedWindow, ...] = described("each window as the chain saw it")
 
 
+class WatchedBlock(NamedTuple):
+    """How near each channel is to an alarm, at 1, after a block of a run."""
+
+    run_id: str
+    start_s: float  #: on the clock of the run, and of all driving
+    driven_s: float
+    why: str  #: it could not be compared; empty where it could
+    levels: Mapping[str, float]
+
+
 class ReplayResult(Result, Replayed):
     """All runs, and the same figures over all of them."""
 
@@ -128,6 +141,11 @@ class ReplayResult(Result, Replayed):
     table_name: str = described("table of target slips")
     runs: tuple[ReplayedRun, ...] = described("terrain, belief and windows of each run")
     skipped: tuple[str, ...] = described("a sentence for each run that could not be read")
+    watch: str | None = described("extended robot that the runs were compared with", default=None)
+    alarms: tuple[Alarm, ...] = described(
+        "departures from it, in the order in which they were raised", default=()
+    )
+    blocks: tuple[WatchedBlock, ...] = described("the comparison, some seconds each", default=())
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a row a window."""
@@ -147,12 +165,21 @@ def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
     read = {name: getattr(settings, name) for name in ("robot", *ReadSettings.model_fields)}
     logs, skipped = load(InspectSettings(data=settings.replay, **read))
     robot = None if settings.robot is None else load_robot(settings.robot)
+    watch, blocks = None, list[WatchedBlock]()
+    if settings.watch is not None:
+        logs = in_order(logs)
+        watch = Watch(read_watched(settings.watch), None, settings.false_alarm_h)
+        robot, name = robot or watch.watched.robot, watch.watched.robot.name
+        if others := [each for each in logs if each.robot != name]:
+            raise ConfigError(
+                f"run {others[0].run_id} is of the robot {others[0].robot!r}, {settings.watch} of {name!r}"
+            )
     runs: list[ReplayedRun] = []
     stop = Event()
     with stopping(stop.set):
         for each in logs:
-            chain = chain_of_run(each, model, table, robot)
-            runs.append(replay_run(each, chain, settings, progress, stop))
+            chain = chain_of_run(each, model, table, robot, watch is not None)
+            runs.append(replay_run(each, chain, settings, progress, stop, watch, blocks))
             if runs[-1].interrupted:
                 break
     figures = replayed(
@@ -163,12 +190,23 @@ def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
         interrupted=any(each.interrupted for each in runs),
     )
     return ReplayResult(
-        **figures, model=settings.model, table_name=table.name, runs=tuple(runs), skipped=tuple(skipped)
+        **figures,
+        model=settings.model,
+        table_name=table.name,
+        runs=tuple(runs),
+        skipped=tuple(skipped),
+        watch=None if settings.watch is None else str(settings.watch),
+        alarms=() if watch is None else tuple(watch.alarms),
+        blocks=tuple(blocks),
     )
 
 
 def chain_of_run(
-    run: RunLog, model: TerrainModel | None, table: SlipTable, robot: Robot | None = None
+    run: RunLog,
+    model: TerrainModel | None,
+    table: SlipTable,
+    robot: Robot | None = None,
+    watched: bool = False,
 ) -> Chain:
     """Return the live chain of a run's robot.
 
@@ -177,6 +215,7 @@ def chain_of_run(
     run : to be replayed
     model, table : of the chain
     robot : description of the robot of runs that bear its name; the package's by default
+    watched : whether it is compared with its model, and needs no other
 
     Raises
     ------
@@ -193,24 +232,30 @@ def chain_of_run(
         if model is None or needs_filter(model.info, channels):
             raise
     pilot = None
-    if found is not None and found.drive == "swerve":
+    if found is not None and found.drive == "swerve" and (model is not None or not watched):
         pilot = PilotSettings(follows=False)  # another controller drove when the log was written
         for name in channels.keys() & CHANNELS.keys():
             if lacking := [each for each in CHANNELS[name] if each not in (*channels[name], UNNEEDED)]:
                 raise DataError(
                     f"run {run.run_id}: stream {name} has no channel {lacking[0]!r} for the pilot"
                 )
-    elif model is None:
+    elif model is None and not watched:
         raise ConfigError(f"run {run.run_id}: robot {run.robot!r} has no pilot: give a model with --model")
     try:
         check_table(table, run.robot)
-        return chain_of(found, channels, model, table, pilot)
+        return chain_of(found, channels, model, table, pilot, watched=watched)
     except (ConfigError, DataError) as error:
         raise DataError(f"run {run.run_id}: {error}") from error
 
 
 def replay_run(
-    run: RunLog, chain: Chain, settings: Settings, progress: Progress = silent, stop: Event | None = None
+    run: RunLog,
+    chain: Chain,
+    settings: Settings,
+    progress: Progress = silent,
+    stop: Event | None = None,
+    watch: Watch | None = None,
+    blocks: list[WatchedBlock] | None = None,
 ) -> ReplayedRun:
     """Send one run through a live chain, each step when it is due.
 
@@ -221,8 +266,12 @@ def replay_run(
     settings : speed and rate of the steps
     progress : of the seconds of the run
     stop : ends it where it is set
+    watch, blocks : compares the run with a model, and where its blocks are added
     """
-    stop = stop or Event()
+    stop, blocks = stop or Event(), [] if blocks is None else blocks
+    driven_s = blocks[-1].driven_s if blocks else 0.0
+    if watch is not None:
+        watch.begin(run.run_id)
     windows: list[ObservedWindow] = []
     believed: Counter[str] = Counter()
     passed_s, start_s, interrupted = 0.0, math.nan, False
@@ -237,6 +286,12 @@ def replay_run(
         passed_s = sample.time_s - start_s
         stop.wait(max(begin_s + passed_s / (settings.speed or math.inf) - perf_counter(), 0.0))
         done = chain.take(sample)
+        if watch is not None:
+            for block in watch.step(sample.readings):
+                driven_s += BLOCK_S
+                blocks.append(WatchedBlock(run.run_id, block.start_s, driven_s, block.why, watch.levels))
+            for sentence in watch.news:
+                print(printable(f"{run.run_id}  {sentence}"), flush=True)
         belief = chain.belief.terrain
         believed[belief] += 1
         for output in done.windows:
@@ -275,19 +330,70 @@ def report(result: ReplayResult) -> Report:
             strip = Strip([(w.start_s, w.end_s, w.believed or UNKNOWN) for w in run.windows])
             panels.append(Panel([strip], title=run.run_id))
     unused = [f"{run.run_id}: not used {format_counts(run.dropped)}" for run in result.runs if run.dropped]
+    watched = [] if result.watch is None else _watched(result)
+    next_step = f"terrain serve --model {result.model}" if result.model else "terrain train --data RUNS"
+    picture = Figure("Terrain that was believed", panels, x_label="time in s") if panels else None
+    answer = (
+        f"{plural(result.n_windows, 'window')} in {format_value(result.duration_s, '.1f', 's')} of driving"
+        f"{accuracy}; {format_value(result.times_real_time, '.0f')} times real time."
+    )
+    if result.watch is not None:
+        if result.alarms:
+            what = f"--robot {result.runs[0].robot} --model {result.watch} --out OUT"
+            next_step = f"terrain explain --data LOG {what} names what has changed"
+        elif not result.model:
+            next_step = f"terrain serve --watch {result.watch}"
+        compared = sum(not block.why for block in result.blocks)
+        answer = (
+            f"{plural(len(result.alarms), 'departure')} from {result.watch} in {compared * BLOCK_S:.0f} s of driving "
+            f"that could be compared, of {result.duration_s:.0f} s."
+        )
     notes = [Text(f"skipped: {sentence}", "warning") for sentence in result.skipped]
     if result.interrupted:
         notes.insert(0, Text("stopped before the end", "note"))
     return Report(
         "Replay of a log",
-        f"{plural(result.n_windows, 'window')} in {format_value(result.duration_s, '.1f', 's')} of driving"
-        f"{accuracy}; {format_value(result.times_real_time, '.0f')} times real time.",
-        picture=Figure("Terrain that was believed", panels, x_label="time in s") if panels else None,
-        parts=[Table(COLUMNS, result.runs), *notes],
+        answer,
+        picture=picture if result.watch is None else _watch_figure(result),
+        parts=[*watched, *([] if result.watch else [Table(COLUMNS, result.runs)]), *notes],
         details=sections(("Not used", unused or ("nothing",))),
         lead=f"model {result.model or 'none'}, table {result.table_name}",
-        next_step=f"terrain serve --model {result.model}" if result.model else "terrain train --data RUNS",
+        next_step=next_step,
     )
+
+
+def _watched(result: ReplayResult) -> list[Part]:
+    """Return the departures, and why blocks could not be compared."""
+    rows = [
+        (each.run_id, each.text, each.raised_s, each.over_s, CHANNEL_WORDS[each.channel][0])
+        for each in result.alarms
+    ]
+    heads = (
+        "run",
+        Column("departure", long=True),
+        Column("raised", ".1f", "s"),
+        Column("over", ".1f", "s"),
+        "channel",
+    )
+    parts: list[Part] = [Table(heads, rows)] if rows else []
+    whys = Counter(block.why for block in result.blocks if block.why)
+    return parts + [
+        Text(f"{plural(n, 'block')} not compared: {why}", "note") for why, n in whys.most_common(3)
+    ]
+
+
+def _watch_figure(result: ReplayResult) -> Figure | None:
+    if not result.blocks:
+        return None
+    driven_s, panels = np.array([block.driven_s for block in result.blocks]), []
+    for channel in result.blocks[0].levels:
+        level = np.array([block.levels[channel] for block in result.blocks])
+        limit = Line("alarm", driven_s, np.ones(len(level)), dashed=True)
+        panels.append(Panel([Line("sum", driven_s, level), limit], title=CHANNEL_WORDS[channel][0]))
+    caption = (
+        "The largest of the channel's sums over the threshold of an alarm, which is held until the sum is 0."
+    )
+    return Figure("Departure from the model", panels, caption, x_label="driving in s")
 
 
 def _fractions(found: Mapping[str, float]) -> str:

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import model_validator
@@ -44,7 +45,7 @@ class ServedSettings(TrustSettings):
     """What is served."""
 
     model: str | None = setting(None)
-    """models:/NAME@champion, models:/NAME/3, or a model folder; without one terrain is unknown (--can, --replay)."""
+    """models:/NAME@champion, models:/NAME/3, or a model folder; without one terrain is unknown (--can, --replay, --watch)."""
     table: Path | None = setting(None, "Table of target slips; the packaged one by default.")
     filter_stride_s: float | None = setting(None, option="--filter-stride")
     """Windows so far apart in s (0.25), filtered over time; as trained otherwise."""
@@ -54,6 +55,10 @@ class ServedSettings(TrustSettings):
     adapt_terrain: str = setting("", "The terrain that each start is on, where it is known.")
     robot: str | None = setting(None)
     """Robot by name, or its YAML file: its description is used for robots of its name."""
+    watch: Path | None = setting(None)
+    """extended.yaml of terrain explain: alarms where that robot departs from it (service and --replay)."""
+    false_alarm_h: float = setting(100.0, option="--false-alarm", gt=0.0, le=1e6)
+    """Hours of driving in which one false alarm of --watch is expected."""
     rate_hz: float = setting(50.0, option="--rate", ge=1.0, le=1000.0)
     """Steps a second of the live chain on a bus or over a log."""
 
@@ -116,6 +121,8 @@ class Settings(ReplaySettings, CanSettings, ServiceSettings, ServedSettings):
         mode = asked[0] if asked else "the WebSocket service"
         modes["the WebSocket service"] = ServiceSettings
         self.refuse_others(mode, modes, "is an option of {of}, not of {mode}")
+        if self.watch is not None and self.can is not None:
+            raise ConfigError("--watch is an option of the WebSocket service and of --replay, not of --can")
         if self.adapt_terrain and self.adapt != "start":
             raise ConfigError("--adapt-terrain is the terrain of each start: --adapt start is required")
         return self
@@ -182,6 +189,9 @@ def required_token(settings: ServiceSettings) -> str:
     return token
 
 
+NO_MODEL = SimpleNamespace(classes=(), channels={}, rate_hz={}, filter="", robots=())
+
+
 class ServiceResult(Result):
     """What a service serves, and what it did until its end."""
 
@@ -193,6 +203,7 @@ class ServiceResult(Result):
     robots: tuple[str, ...] = described("robots whose runs it was trained on")
     table: str = described("table of target slips")
     robot: str | None = described("robot that model and table were checked against")
+    watch: str | None = described("extended robot that robots of its name are compared with", default=None)
     served: Mapping[str, int] | None = described(
         "sessions, messages, rows, steps, errors and wrong tokens until its end; null with --check",
         default=None,
@@ -208,13 +219,15 @@ def run(settings: Settings, progress: Progress = silent) -> Result:
         return result
     service = import_module("pipelines.serve.service").Service(settings)
     served = service.hub.served
-    assert served.model is not None  # a service begins with one
-    info, table = served.model.info, served.table.name
-    result = ServiceResult.of(info, settings, model=served.model_name, table=table)
+    info = NO_MODEL if served.model is None else served.model.info
+    about = {"model": served.model_name, "table": served.table.name}
+    result = ServiceResult.of(
+        info, settings, **about, watch=None if settings.watch is None else str(settings.watch)
+    )
     if settings.check:
         service.close()
         return result
-    service.run(lambda url: print(f"serving {settings.model} at {url}", flush=True))
+    service.run(lambda url: print(f"serving {settings.model or settings.watch} at {url}", flush=True))
     return replace(result, served=service.hub.metrics.totals())
 
 
@@ -225,10 +238,15 @@ def report(result: ServiceResult) -> Report:
         (f"{stream}, {result.rate_hz[stream]:g} Hz", enumerated(names))
         for stream, names in result.channels.items()
     ]
+    options = f"--model {result.model}" if result.model else f"--watch {result.watch}"
     answer = f"{result.model} can be served: {enumerated(result.classes)}."
-    next_step = f"terrain serve --model {result.model}"
+    if not result.model:
+        answer = f"Robots can be compared with {result.watch}."
+    next_step = f"terrain serve {options}"
     if (done := result.served) is not None:
-        answer = f"{plural(done['sessions'], 'session')} of robots served with {result.model}."
+        answer = (
+            f"{plural(done['sessions'], 'session')} of robots served with {result.model or result.watch}."
+        )
         next_step = "terrain convert RECORDINGS --out RUNS makes runs of what was recorded"
         parts.insert(0, Pairs([(name.replace("_", " "), n) for name, n in done.items()]))
     details = sections(("Channels that the model needs", [Pairs(needs)]))

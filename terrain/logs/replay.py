@@ -11,7 +11,7 @@ from terrain.logs.samples import longest_rise
 from terrain.logs.schema import TWIST
 from terrain.records import Array, Reading, RunLog, Sample
 
-SENSORS: tuple[str, ...] = ("wheels", "steering", "imu", "odometry", "gnss", "compass", "pose")
+SENSORS: tuple[str, ...] = ("wheels", "steering", "imu", "odometry", "gnss", "compass", "pose", "lidar")
 """Streams that a robot's sensors write; the others are commands, truth and what was made of them."""
 
 

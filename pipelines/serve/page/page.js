@@ -89,6 +89,7 @@
     const seen = step.observation;
     showTerrain(step, seen);
     showAnswer(message, seen, step.command);
+    showWatch(seen.watch);
     showTarget(seen);
     showCommand(session, step.command);
     showSensors(seen.sensors);
@@ -110,6 +111,14 @@
       select.disabled = true;
     }
     if (message.session && select.value !== message.session.session && document.activeElement !== select) select.value = message.session.session;
+  }
+  function showWatch(watch) {
+    byId("watch").hidden = !watch;
+    if (!watch) return;
+    const channels = Object.entries(watch.channels).map(([name, status]) => name + " " + status);
+    byId("watch").dataset.state = watch.alarms.length ? "alarm" : "";
+    text("watch", watch.alarms.length ? "The robot " + watch.alarms.map((alarm) => alarm.text).join("; ")
+      : channels.join("; ") + (watch.why ? " (" + watch.why + ")" : ""));
   }
   function showTerrain(step, seen) {
     text("terrain", seen.terrain || "unknown");

@@ -14,6 +14,7 @@ from pipelines.report.terminal import terminal_text
 from pipelines.slip import calibrate
 from pipelines.slip.estimate import estimate_runs
 from terrain.discrepancy.verdict import INTERVAL_T
+from terrain.discrepancy.watch import read_watched
 from terrain.effects import SPEED_X
 from terrain.errors import ConfigError, TerrainError
 from terrain.extension import extended_yaml
@@ -45,6 +46,9 @@ def test_the_hidden_cause_is_named_built_in_and_absent_when_tested_again(terrain
     (value,) = found["causes"][0]["parameters"]
     std = (value["ci"][1] - value["ci"][0]) / (2 * INTERVAL_T)
     assert abs(value["value"] - 0.04) < 4 * std
+    watched = read_watched(place / "found" / EXTENDED_FILE)
+    assert "7 runs of" in watched.source
+    assert ("yaw_rate_radps", "along") in watched.deviations
     lines = out.splitlines()
     assert "with the camera turned" in lines[0]
     assert "judged on 2 runs held out" in lines[0]

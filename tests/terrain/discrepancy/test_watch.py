@@ -1,0 +1,240 @@
+"""A robot is watched: quiet drives raise no more alarms than stated, hidden changes are found, live equals log."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from terrain.discrepancy.watch import (
+    BLOCK_S,
+    OVERSHOOT,
+    REFERENCE,
+    Block,
+    Status,
+    Watch,
+    Watched,
+    _deviation,
+    barrier,
+    blocks_of,
+    read_watched,
+    simulation_of,
+    watch_lines,
+    watched_on,
+)
+from terrain.errors import ConfigError
+from terrain.logs.replay import replay
+from terrain.records import Reading, RunLog, Stream
+from terrain.robots import Region, description_file, load_robot
+
+HUSKY = load_robot("husky")
+
+
+@pytest.fixture(scope="module")
+def watched(hide):
+    """A husky with the deviations of twelve quiet runs."""
+    return watched_on(hide({}, n=12, seed=3), HUSKY, "twelve quiet runs")
+
+
+def watch_runs(watched, runs, **settings):
+    """Return the watch after runs, and the time of driving when the first alarm was raised."""
+    watch, driven_s, first_s = Watch(watched, **settings), 0.0, np.nan
+    for run in runs:
+        watch.begin(run.run_id)
+        for sample in replay(run, 5.0):
+            watch.step(sample.readings)
+            if watch.raised and np.isnan(first_s):
+                first_s = driven_s + watch.raised[0].raised_s
+        driven_s += run.end_s
+    return watch, first_s
+
+
+def test_time_between_false_alarms_is_that_of_the_formula_and_of_simulated_sums():
+    stated, n = 300.0, 4000
+    threshold, rng = barrier(stated, REFERENCE) - OVERSHOOT, np.random.default_rng(1)
+    total, lengths, running = np.zeros(n), np.zeros(n), np.ones(n, bool)
+    while running.any():
+        total = np.maximum(total + rng.normal(size=n) - REFERENCE, 0.0)
+        lengths += running
+        running &= total < threshold
+    assert lengths.mean() == pytest.approx(stated, rel=4.0 / np.sqrt(n))
+
+
+def quiet_numbers(rng, n, session_std, correlation=0.3):
+    """Return figures and sizes of blocks that are alike when they follow each other, of one session."""
+    e = rng.uniform(5.0, 20.0, n)
+    z = np.empty(n)
+    z[0] = rng.normal()
+    for i in range(1, n):
+        z[i] = correlation * z[i - 1] + np.sqrt(1.0 - correlation**2) * rng.normal()
+    return (z + session_std * rng.normal()) * np.sqrt(0.01 + 0.002 * e), e
+
+
+@pytest.mark.parametrize("session_std", [0.0, 0.3])
+def test_no_more_false_alarms_than_stated(session_std):
+    rng, hours = np.random.default_rng(5), 25
+    quiet = []
+    for session in range(5):
+        quiet += [(str(session), *pair) for pair in zip(*quiet_numbers(rng, 60, session_std), strict=True)]
+    of = [("yaw_rate_radps", "along"), ("speed_x_mps", "along")]
+    watch = Watch(Watched(HUSKY, 20.0, dict.fromkeys(of, _deviation(quiet, "along")), ""), false_alarm_h=1.0)
+    for hour in range(hours):
+        for k, pair in enumerate(
+            zip(
+                *[zip(*quiet_numbers(rng, int(3600 / BLOCK_S), session_std), strict=True) for _ in of],
+                strict=True,
+            )
+        ):
+            figures = {name: (*each, each[1]) for name, each in zip(of, pair, strict=True)}
+            watch.take(Block(3600.0 * hour + BLOCK_S * k, Status.AGREES, figures=figures))
+    assert len(watch.alarms) <= hours + 2.0 * np.sqrt(hours)
+
+
+def test_quiet_drives_agree(hide, watched):
+    watch, _ = watch_runs(watched, hide({}, n=12, seed=11))
+    assert not watch.alarms
+    assert Status.AGREES in watch.status.values()
+
+
+@pytest.mark.parametrize(
+    ("hidden", "channel", "size"),
+    [
+        ({"wheel_radius_ratio": -0.05}, "speed_x_mps", -0.05),
+        ({"effective_track_ratio": 0.15}, "yaw_rate_radps", 1 / 1.15 - 1),
+        ({"gyro_scale_ratio": 0.05}, "yaw_rate_radps", 0.05),
+        ({"payload_ratio": 0.4}, "current_a", 0.25),
+    ],
+)
+def test_a_hidden_change_is_found(hide, watched, hidden, channel, size):
+    watch, first_s = watch_runs(watched, hide(hidden, n=12, seed=12))
+    assert first_s < 300.0
+    sizes = [alarm.size for alarm in watch.alarms if (alarm.channel, alarm.kind) == (channel, "along")]
+    assert sizes == [pytest.approx(size, rel=0.2)]
+
+
+def test_an_alarm_is_held_until_the_departure_is_over(hide, watched):
+    changed, quiet = hide({"gyro_scale_ratio": 0.1}, n=8, seed=12), hide({}, n=12, seed=13)
+    watch, _ = watch_runs(watched, [*changed, *quiet])
+    assert watch.alarms
+    for alarm in watch.alarms:
+        assert alarm.run_id in [run.run_id for run in changed]
+        assert np.isfinite(alarm.over_s)
+    assert not watch.current
+
+
+@pytest.fixture(scope="module")
+def long_run(hide):
+    return hide({"gyro_scale_ratio": 0.1}, n=1, duration_s=60.0, seed=14)[0]
+
+
+def test_live_is_the_log_however_samples_come(watched, long_run):
+    blocks = blocks_of(long_run, simulation_of(HUSKY), watched.clock_hz)
+    assert sum(block.status is Status.AGREES for block in blocks) > 15
+    for rate_hz in (1.0, 20.0):
+        watch, live = Watch(watched), []
+        for sample in replay(long_run, rate_hz):
+            live += watch.step(sample.readings)
+        assert live == blocks[: len(live)]
+        assert len(live) >= len(blocks) - 1
+
+
+def without(run, stream, start_s, end_s):
+    """The run, whose stream has no samples from start to end."""
+    old = run.streams[stream]
+    kept = (old.time_s < start_s) | (old.time_s > end_s)
+    return RunLog(
+        run.run_id,
+        run.robot,
+        {**run.streams, stream: Stream(old.time_s[kept], old.values[kept], old.channels)},
+    )
+
+
+@pytest.mark.parametrize("stream", ["imu", "odometry", "wheels"])
+def test_a_sensor_that_is_silent_is_no_alarm(hide, watched, stream):
+    run = hide({}, n=1, duration_s=60.0, seed=15)[0]
+    watch = Watch(watched)
+    for sample in replay(without(run, stream, 20.0, 40.0), 5.0):
+        watch.step(sample.readings)
+        if stream != "wheels" and sample.time_s == pytest.approx(38.0, abs=0.1):
+            silent = [name for name, status in watch.status.items() if status is Status.SILENT]
+            assert silent == (
+                ["yaw_rate_radps", "accel_x_mps2"] if stream == "imu" else ["speed_x_mps", "speed_y_mps"]
+            )
+    assert not watch.alarms
+    assert Status.SILENT not in watch.status.values()
+
+
+def test_standstill_and_what_was_not_validated_are_no_alarm(hide, watched):
+    run = hide({}, n=1, duration_s=20.0, seed=15)[0]
+    wheels = run.streams["wheels"]
+    for factor, status in ((0.0, Status.STANDS), (3.0, Status.OUTSIDE)):
+        values = factor * wheels.values
+        changed = {**run.streams, "wheels": Stream(wheels.time_s, values, wheels.channels)}
+        region = Region((-1.0, 1.0), (-2.0, 2.0), None, ())
+        watch = Watch(replace(watched, robot=replace(HUSKY, region=region)))
+        for sample in replay(RunLog("a", "husky", changed), 5.0):
+            watch.step(sample.readings)
+        assert set(watch.status.values()) == {status}
+        assert not watch.alarms
+
+
+@pytest.mark.parametrize("values", [np.nan, np.inf, 1e300])
+def test_nonsense_is_no_alarm_and_raises_nothing(watched, long_run, values):
+    channels = {name: stream.channels for name, stream in long_run.streams.items()}
+    watch = Watch(watched, channels)
+    for sample in replay(long_run, 5.0):
+        watch.step({name: Reading(t, np.full(x.shape, values)) for name, (t, x) in sample.readings.items()})
+    wheels = np.zeros((1, len(channels["wheels"])))
+    watch.step({"wheels": Reading(np.array([np.nan]), wheels), "imu": Reading(np.empty(0), np.empty((0, 9)))})
+    watch.step({"wheels": Reading(np.array([1e12]), wheels), "unknown": Reading(np.zeros(1), wheels)})
+    assert not watch.alarms
+
+
+# -- The section of a description ------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def described(tmp_path):
+    """Return a function that writes a husky with a section ``watch``."""
+
+    def write(section):
+        path = tmp_path / "extended.yaml"
+        path.write_text(description_file("husky").read_text(encoding="utf-8") + section, encoding="utf-8")
+        return path
+
+    return write
+
+
+def test_a_section_is_read_as_it_was_written(described, watched):
+    read = read_watched(described("\n".join(watch_lines(watched))))
+    assert read.robot.name == "husky"
+    assert read.deviations.keys() == watched.deviations.keys()
+    for of, each in watched.deviations.items():
+        assert read.deviations[of] == pytest.approx(each, rel=1e-6)
+
+
+HEAD = "watch:\n  schema: 1\n  source: me\n  clock_hz: 20\n  deviations:\n"
+ENTRY = "{noise: 1.0, scatter: 0.0, memory: 1.0, spread: 1.0, offset: 0.1, least: 0.0, blocks: 9}"
+
+
+@pytest.mark.parametrize(
+    ("section", "sentence"),
+    [
+        ("", "extended.yaml: has no section 'watch'"),
+        ("watch: 3\n", "watch"),
+        ("watch: {schema: 1}\n", "watch"),
+        (f"{HEAD}    speed_x_mps level: {ENTRY}\n".replace("schema: 1", "schema: 2"), "reads 1"),
+        (f"{HEAD}    speed_x_mps level: {ENTRY}\n".replace("20", "fast"), "a clock of 1 to 50 Hz"),
+        (f"{HEAD}    speed_x_mps: {ENTRY}\n", "'speed_x_mps' is no channel and kind"),
+        (f"{HEAD}    speed level: {ENTRY}\n", "'speed level' is no channel and kind"),
+        (HEAD, "one by channel and kind is required"),
+        (f"{HEAD}    speed_x_mps level: {ENTRY}\n".replace("0.1", "-1"), "numbers from 0 up"),
+        (f"{HEAD}    speed_x_mps level: {ENTRY}\n".replace("noise: 1.0", "noise: .nan"), "numbers from 0 up"),
+        (f"{HEAD}    speed_x_mps level: {ENTRY}\n".replace("noise: 1.0", "noise: 0"), "above 0 are required"),
+        (f"{HEAD}    speed_x_mps level: {ENTRY}\n".replace("noise: 1.0, ", ""), "noise"),
+    ],
+)
+def test_a_section_that_is_not_accepted_is_one_sentence(described, section, sentence):
+    with pytest.raises(ConfigError) as refused:
+        read_watched(described(section))
+    assert sentence in str(refused.value)
+    assert "\n" not in str(refused.value)
