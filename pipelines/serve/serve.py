@@ -45,7 +45,7 @@ class ServedSettings(TrustSettings):
     """What is served."""
 
     model: str | None = setting(None)
-    """models:/NAME@champion, models:/NAME/3, or a model folder; without one terrain is unknown (--can, --replay, --watch)."""
+    """models:/NAME@champion, models:/NAME/3, or a folder; without one terrain is unknown (--can, --replay, --watch)."""
     table: Path | None = setting(None, "Table of target slips; the packaged one by default.")
     filter_stride_s: float | None = setting(None, option="--filter-stride")
     """Windows so far apart in s (0.25), filtered over time; as trained otherwise."""

@@ -124,7 +124,7 @@ class Alarm(NamedTuple):
 
         Examples
         --------
-        >>> Alarm("yaw_rate_radps", "along", 12.0, 30.0, -0.12).text
+        >>> Alarm("heading_rate_radps", "along", 12.0, 30.0, -0.12).text
         'turns 12 % less than its model since 12.0 s'
         """
         of_run = f" of {self.since_run_id}" if self.since_run_id else ""
@@ -147,8 +147,8 @@ def departure(channel: str, kind: str, size: float) -> str:
 
     Examples
     --------
-    >>> departure("speed_x_mps", "along", -0.05), departure("gyro_z_radps", "level", 0.031)
-    ('drives 5 % slower than its model', 'yaw rate (gyro) is 0.031 rad/s more to the left than of its model')
+    >>> departure("speed_x_mps", "along", -0.05), departure("yaw_rate_radps", "level", 0.031)
+    ('drives 5 % slower than its model', 'yaw rate (gyro) is 0.031 rad/s more to the left than its model')
     """
     if kind == "along":
         verb, more, less = ALONG[channel]
@@ -159,7 +159,7 @@ def departure(channel: str, kind: str, size: float) -> str:
     name, unit = CHANNEL_WORDS[channel]
     turns = channel in (GYRO, HEADING, SPEED_Y)
     side = ("more to the left", "more to the right") if turns else ("more", "less")
-    return f"{name} is {abs(size):.2g} {unit} {side[size < 0]} than of its model"
+    return f"{name} is {abs(size):.2g} {unit} {side[size < 0]} than its model"
 
 
 def clock_text(time_s: float) -> str:
