@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
 
@@ -170,7 +171,8 @@ def find_causes(
     check_ids(runs)
     if len(runs) < MIN_RUNS:
         raise DataError(f"runs: there are {len(runs)}, at least {MIN_RUNS} are required, to hold some out")
-    signals = [signals_of(run, simulation.robot) for run in runs] if signals is None else signals
+    if signals is None:
+        signals = [replace(signals_of(run, simulation.robot), place=float(k)) for k, run in enumerate(runs)]
     effects = simulation.library if library is None else tuple(library)
 
     # faults are repaired, lags that a search has to start from are known, and unfit runs are excluded

@@ -223,7 +223,13 @@ FAULTS = (
     Written("wheels late", "drive_warthog_terrains", WHEELS, late(0.4), {LAG: -0.4, "encoder_lag_s": 0.4}),
     Written("IMU clock 2 % slow", "warthog_grass", IMU_Z, slow(0.02), {RATE: 0.02}),
     Written("wheel clock 2 % slow", "borealtc", {"wheels": ("",)}, slow(0.02), {RATE: -0.02}),
-    Written("gyro scale", "drive_husky", IMU_Z, times(1.15), {"gyro_scale_ratio": 0.15}),
+    Written(
+        "gyro scale",
+        "drive_husky",
+        IMU_Z,
+        times(1.15),
+        {"scale/gyro": 0.0, "gyro_scale_ratio": 0.15},  # it is beyond what a builder believes of a sensor
+    ),
     Written("gyro x for z", "vulpi", X_AND_Z, exchanged, {"axes/gyro": 0.0}),
     Written("gyro y for z", "borealtc", Y_AND_Z, exchanged, {"axes/gyro": 0.0}),
     Written("gyro x for z, recording", "warthog_grass", X_AND_Z, exchanged, {"axes/gyro": 0.0}),

@@ -27,6 +27,7 @@ class FaultKind(StrEnum):
     UNIT = "unit"
     SWAPPED = "swapped"
     OFFSET = "offset"
+    SCALE = "scale"
     AXES = "axes"
     DROPOUT = "dropout"
     SATURATION = "saturation"
@@ -61,23 +62,21 @@ DEG, RPM, KMH, MILLI = math.pi / 180.0, math.pi / 30.0, 1.0 / 3.6, 1e-3
 
 
 class _Kind(NamedTuple):
-    """Of a column: measured channels, name in logs, unit, other units that loggers have, largest offset, its sides."""
+    """Of a column: measured channels, name in logs, unit, other units that loggers have, and its sides."""
 
     channels: tuple[int, ...]
     logged: str
     si: str
     units: dict[str, float]
-    largest: float = math.inf
     sides: str = ""
 
 
-#: By column; wheel speeds are the inputs of the simulation.  The largest offset is half more than the bounds of the
-#: catalogue's biases, and for a heading rate and a speed, which have none, as much and a slow robot's speed.
+#: By column; wheel speeds are the inputs of the simulation.
 KINDS = {
-    Column.GYRO: _Kind((G,), "gyro_z_radps", "rad/s", {"deg/s": DEG, "rpm": RPM}, 0.3),
-    Column.HEADING: _Kind((H,), "yaw_rate_radps", "rad/s", {"deg/s": DEG, "rpm": RPM}, 0.3),
-    Column.SPEED: _Kind((X, Y), "speed_x_mps and speed_y_mps", "m/s", {"km/h": KMH, "mm/s": MILLI}, 0.3),
-    Column.ACCEL: _Kind((A,), "accel_x_mps2", "m/s^2", {"g": GRAVITY_MPS2}, 3.0),
+    Column.GYRO: _Kind((G,), "gyro_z_radps", "rad/s", {"deg/s": DEG, "rpm": RPM}),
+    Column.HEADING: _Kind((H,), "yaw_rate_radps", "rad/s", {"deg/s": DEG, "rpm": RPM}),
+    Column.SPEED: _Kind((X, Y), "speed_x_mps and speed_y_mps", "m/s", {"km/h": KMH, "mm/s": MILLI}),
+    Column.ACCEL: _Kind((A,), "accel_x_mps2", "m/s^2", {"g": GRAVITY_MPS2}),
     Column.CURRENTS: _Kind(
         (AMPS, T), "the currents", "A", {"mA": MILLI}, sides="current_left_a and current_right_a"
     ),
@@ -104,6 +103,7 @@ class Change(NamedTuple):
     pair: tuple[int, int] = (0, 1)  #: wheels that are exchanged
     axis: int = -1  #: place in IMU_AXES of the axis that is in the column's place
     drift: float = 0.0  #: that is added each second of a run
+    over_runs: float = 0.0  #: that is added from run to run, in their order
 
     @property
     def of_wheels(self) -> bool:
@@ -145,7 +145,8 @@ class Change(NamedTuple):
             return replace(run, measured=measured)
         measured = self.measured(run.measured)
         if self.kind is FaultKind.DRIFT:
-            measured[:, own[0]] += self.drift * (run.time_s - run.start_s)
+            place = run.place if math.isfinite(run.place) else 0.0
+            measured[:, own[0]] += self.drift * (run.time_s - run.start_s) + self.over_runs * place
         if not self.of_wheels:
             return replace(run, measured=measured)
         n = run.wheel_speed_mps.shape[1]
@@ -256,6 +257,12 @@ def change_in_words(change: Change, robot: Robot) -> tuple[str, str]:
         axis, own = IMU_AXES[change.axis], IMU_AXES[3 * (change.axis // 3) + (2 if change.axis < 3 else 0)]
         sign = "" if change.factor > 0 else ", with its sign turned"
         return f"axes of {name} are exchanged: {own} is in {axis}{sign}", f"take {own} from {axis}{sign}"
+    if change.kind is FaultKind.DRIFT and change.over_runs:
+        size, first = f"{-change.over_runs:.2g} {kind.si} from run to run", logged.split(" and ")[0]
+        return (
+            f"the zero of {name} drifts by {size}",
+            f"subtract {-change.offset:.2g} and {size} from {first}",
+        )
     if change.kind is FaultKind.DRIFT:
         size, first = f"{-change.drift:.2g} {kind.si} a second", logged.split(" and ")[0]
         return f"the zero of {name} drifts by {size} in each run", f"subtract {size} from {first}"
@@ -264,6 +271,9 @@ def change_in_words(change: Change, robot: Robot) -> tuple[str, str]:
         hint = f"mapping file: offset: {change.offset:.3g}"
         return f"{name} has an offset of {size}", f"subtract {size} from {first} ({hint})"
     hint = f"scale: {change.factor:.4g}"
+    if change.kind is FaultKind.SCALE:
+        what = f"{name} reads {abs(1.0 / change.factor - 1.0):.0%} too {'much' if change.factor < 1.0 else 'little'}"
+        return what, f"multiply {logged} by {change.factor:.4g} (mapping file: {hint})"
     if change.kind is FaultKind.SIGN:
         what = f"the sign of {name} is turned" if several else f"{name}'s sign is turned"
         hint = "scale: -1"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from terrain.discrepancy.health.fault import (
     fault_of,
     session_of,
 )
-from terrain.discrepancy.health.offsets import drift_faults, offset_faults
+from terrain.discrepancy.health.offsets import drift_faults, drifting_zeros, offset_faults, scale_faults
 from terrain.discrepancy.health.readings import Reading, reading_of, turned_fault
 from terrain.discrepancy.health.samples import lost_samples
 from terrain.discrepancy.health.units import unit_faults
@@ -33,6 +34,7 @@ from terrain.robots import Robot
 
 #: Signs and exchanges that are searched one after the other; logs with more are no logs of this robot.
 MAX_FAULTS = 4
+SAME_END = 0.01  #: Relative difference of the two ends of a sensor's range.
 
 
 def faults_of(
@@ -42,11 +44,14 @@ def faults_of(
     low_pass: LowPass,
     latencies: Latencies,
 ) -> tuple[Fault, ...]:
-    """Return the faults of channels, in the order in which they are to be repaired: signs, units, offsets.
+    """Return the faults of channels, in the order in which they are to be repaired: signs, units, offsets, scales.
 
     ``rows`` are those of the runs by the simulation, ``latencies`` the lags of their channels.
     """
-    runs, logs, robot = list(signals), list(rows), simulation.robot
+    logs, robot = list(rows), simulation.robot
+    runs = [
+        run if math.isfinite(run.place) else replace(run, place=float(k)) for k, run in enumerate(signals)
+    ]
     ids, faults = [run.run_id for run in rows], []
     sessions = [run.session or session_of(run.run_id) for run in signals]
 
@@ -70,17 +75,17 @@ def faults_of(
     for fault in _lost_samples(runs, logs, ids, robot):
         repair(fault)
     for _ in range(MAX_FAULTS):
-        before = agreement_of(responses())
+        before = agreement_of(aligned := responses(), robot.sideways)
 
         def tried(change: Change, places: Sequence[int], before: Agreement = before) -> Reading:
             """Return what a change makes of the runs at some places."""
             after = Agreement(*(each.copy() for each in before))
-            own = agreement_of(on_own_clocks([without(change, i) for i in places], latencies))
+            own = agreement_of(on_own_clocks([without(change, i) for i in places], latencies), robot.sideways)
             for whole, part in zip(after, own, strict=True):
                 whole[list(places)] = part
-            return reading_of(change, before, after, robot.sideways)
+            return reading_of(change, before, after)
 
-        turned = turned_fault(before, tried, ids, sessions, robot)
+        turned = turned_fault(before, tried, aligned, sessions, robot)
         if turned is None:
             break
         repair(turned)
@@ -88,7 +93,11 @@ def faults_of(
             break
     for fault in unit_faults(responses(), sessions, robot):
         repair(fault)
+    for fault in drifting_zeros(responses(), robot):
+        repair(fault)
     for fault in offset_faults(responses(), sessions, robot):
+        repair(fault)
+    for fault in scale_faults(responses(), sessions, robot):
         repair(fault)
     return (*faults, *drift_faults(responses(), sessions, robot))
 
@@ -98,12 +107,23 @@ def _lost_samples(
 ) -> tuple[Fault, ...]:
     """Return the columns that hold a value, or are clipped, in some runs: these samples are left out."""
     seconds: dict[Change, dict[int, float]] = {}
+    ends: dict[Change, list[float]] = {}
     columns = {c: column for column, kind in KINDS.items() for c in kind.channels}
     for i, (run, beside) in enumerate(zip(signals, rows, strict=True)):
         for lost in lost_samples(run, beside):
             kind = FaultKind.SATURATION if lost.is_clipped else FaultKind.DROPOUT
-            of_runs = seconds.setdefault(Change(kind, columns[lost.channel], math.nan), {})
+            change = Change(kind, columns[lost.channel], math.nan)
+            of_runs = seconds.setdefault(change, {})
             of_runs[i] = max(of_runs.get(i, 0.0), lost.seconds)
+            ends.setdefault(change, []).append(abs(lost.value))
+    for change in [each for each in seconds if each.kind is FaultKind.SATURATION]:
+        held = change._replace(kind=FaultKind.DROPOUT)
+        n_runs, is_one_end = len(seconds[change]), np.ptp(ends[change]) <= SAME_END * max(ends[change])
+        if not is_one_end or (
+            n_runs == 1 < len(seconds.get(held, {}))
+        ):  # a sensor's range has one end in all runs
+            of_runs = seconds.pop(change)
+            seconds[held] = of_runs | seconds.get(held, {})
     return tuple(
         fault_of(change, [*of], ids, f": for {np.median([*of.values()]):.1f} s of a run", robot)
         for change, of in seconds.items()

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.health.agreement import FOLLOWERS, MOTION, Agreement, H, Y
+from terrain.discrepancy.health.agreement import FOLLOWERS, LEAST, MOTION, Agreement, H, joined
 from terrain.discrepancy.health.fault import (
     KINDS,
     Change,
@@ -21,8 +22,10 @@ from terrain.discrepancy.health.fault import (
     fault_of,
 )
 from terrain.discrepancy.health.sessions import faulty_runs, halves
+from terrain.discrepancy.runs import Rows
 from terrain.records import Array
 from terrain.robots import Robot
+from terrain.signals import agreement
 
 # Every reading of a run that is one fault away is tried: a change of its measured channels, or of its wheels,
 # which are then simulated again.  Under the right one all channels follow the wheels, each with a gain above
@@ -80,10 +83,9 @@ def candidate_changes(robot: Robot) -> Changes:
     return (*changes, *(Change(sign, Column.WHEELS, -1.0, wheel) for wheel in (-1, *each)))
 
 
-def reading_of(change: Change, before: Agreement, after: Agreement, sideways: bool = False) -> Reading:
-    """Return what a change makes of runs; the lateral speed of a robot that drives sideways follows its wheels too."""
-    followers = [*FOLLOWERS, Y] if sideways else FOLLOWERS
-    old, new = before.correlation[:, followers], after.correlation[:, followers]
+def reading_of(change: Change, before: Agreement, after: Agreement) -> Reading:
+    """Return what a change makes of runs."""
+    old, new = before.correlation[:, FOLLOWERS], after.correlation[:, FOLLOWERS]
     gain = after.likelihood.sum(axis=1) - before.likelihood.sum(axis=1)
     turned = (old < TURNED) & (new > RIGHT)
     asked = old != 0.0  # what a run does not show cannot be wrong in it
@@ -99,7 +101,7 @@ def reading_of(change: Change, before: Agreement, after: Agreement, sideways: bo
 def turned_fault(
     before: Agreement,
     tried: Callable[[Change, Sequence[int]], Reading],
-    ids: Sequence[str],
+    runs: Sequence[Rows],
     sessions: Sequence[str],
     robot: Robot,
 ) -> Fault | None:
@@ -108,9 +110,9 @@ def turned_fault(
     It is the reading that gains most over the runs that it mends, of those that whole sessions or successive runs have,
     and that two halves of these runs find each by itself.  Readings that are as good on the same runs are mirror
     images, left for right or ahead for back: no channel tells which it is, and the diagnosis is that of either but for
-    the side.
+    the side.  Where a sign shows in the level of one steady motion only, an offset is as good.
     """
-    fit = before.correlation[:, [*FOLLOWERS, Y] if robot.sideways else FOLLOWERS]
+    ids, fit = [run.run_id for run in runs], before.correlation[:, FOLLOWERS]
     suspects = np.flatnonzero(((fit != 0.0) & (fit < RIGHT)).any(axis=1)).tolist()
     readings = [tried(change, suspects) for change in candidate_changes(robot)] if suspects else []
     readings = [reading for reading in readings if reading.mends.any()]
@@ -129,9 +131,31 @@ def turned_fault(
         others = [each.change for each in readings if left and each.change not in equal]
         if any(tried(each, left).suits[left].sum() > MAX_OTHER_RATIO * len(shown) for each in others):
             continue
-        if parts[1] and not all(equal & {*_equal_readings(readings, part)} for part in parts):
+        rest = halves([i for i in has if i not in shown])
+        if parts[1] and not all(
+            equal & {*_equal_readings(readings, part)}
+            or _is_best(best, readings, tried, part, [*part, *more])
+            for part, more in zip(parts, rest, strict=True)
+        ):
+            continue
+        offset = _offset_for_sign(change, [runs[i] for i in shown])
+        if (
+            offset is not None and not offset.offset
+        ):  # the channel follows about its mean, with the sign that it has
             continue
         seen = _evidence(before, best, shown)
+        if offset is not None:
+            seen += (
+                f" (steady as the motion is, another reading is as good: {change_in_words(offset, robot)[0]})"
+            )
+            left_out = f"{KINDS[change.column].logged} is left out"
+            fault = fault_of(change, has, ids, seen, robot)
+            sentence = f"{fault.sentence.removesuffix(fault.repair)}so that {left_out}"
+            nothing = change._replace(factor=math.nan)
+            fault = Fault(
+                nothing, fault.run_ids, sentence, left_out, FaultStatus.UNDECIDED, (offset, *rivals)
+            )
+            return fault if parts[1] else fault._replace(status=FaultStatus.NOT_CONFIRMED)
         if rivals:
             alike = " or ".join(change_in_words(rival, robot)[0] for rival in rivals)
             seen += f" (these channels cannot distinguish it from another reading: {alike})"
@@ -140,6 +164,41 @@ def turned_fault(
             return fault._replace(status=FaultStatus.NOT_CONFIRMED)
         return fault._replace(status=FaultStatus.UNDECIDED, rivals=tuple(rivals)) if rivals else fault
     return None
+
+
+def _is_best(
+    best: Reading,
+    readings: Sequence[Reading],
+    tried: Callable[[Change, Sequence[int]], Reading],
+    part: Sequence[int],
+    whole: Sequence[int],
+) -> bool:
+    """Return whether the readings that gain more in the part of runs that one mends gain less than it in the whole."""
+    nets = [float(tried(each, whole).gain[list(whole)].sum()) for each in _equal_readings(readings, part)]
+    return max(nets, default=math.inf) < float(best.gain[list(whole)].sum()) - TIE
+
+
+def _offset_for_sign(change: Change, runs: Sequence[Rows]) -> Change | None:
+    """Return the offset that is as good as a turned sign in runs that move alike; None where they tell the two apart.
+
+    It is 0 where the channel, about its mean over all of them, follows the wheels with the sign that it has.
+    """
+    if (
+        change.kind is not FaultKind.SIGN
+        or change.of_wheels
+        or KINDS[change.column].channels[0] not in MOTION
+    ):
+        return None
+    c = KINDS[change.column].channels[0]
+    together = joined(runs)
+    measured, predicted = together.measured[:, c], together.predicted[:, c]
+    known = np.isfinite(measured) & np.isfinite(predicted)
+    m, p = measured[known] - measured[known].mean(), predicted[known] - predicted[known].mean()
+    follows = float(agreement(m[:, None], p[:, None])[0][0]) if np.std(p) > LEAST[c] else 0.0
+    if follows < -TURNED:
+        return None
+    offset = float((predicted - measured)[known].mean()) if follows < TURNED else 0.0
+    return Change(FaultKind.OFFSET, change.column, offset=offset)
 
 
 def _equal_readings(readings: Sequence[Reading], places: Sequence[int]) -> list[Change]:

@@ -80,7 +80,7 @@ Options = tuple[list[Changes], Array]
 
 def unit_faults(runs: Sequence[Rows], sessions: Sequence[str], robot: Robot) -> tuple[Fault, ...]:
     """Return columns whose unit is not that of their name, in all runs, in sessions, or in successive runs of one."""
-    follows, keys, ids = agreement_of(runs), list(KEYS), [run.run_id for run in runs]
+    follows, keys, ids = agreement_of(runs, robot.sideways), list(KEYS), [run.run_id for run in runs]
     gain, fit = follows.gain[:, keys], follows.correlation[:, keys]
     clear = np.isfinite(gain) & (gain > 0) & (np.abs(fit) > MIN_FIT)
     logs = np.log(np.where(clear, gain, np.nan))

@@ -15,11 +15,20 @@ from studies.blind_trials.trial import hidden_runs, simulation_of, with_late_str
 
 from pipelines.data.datasets import load_runs
 from terrain.discrepancy.clocks import latencies_of, shifts_of
-from terrain.discrepancy.health.agreement import AMPS, A, Agreement, G, X, agreement_of, on_own_clocks
+from terrain.discrepancy.health.agreement import (
+    AMPS,
+    A,
+    Agreement,
+    G,
+    X,
+    Y,
+    agreement_of,
+    on_own_clocks,
+    zero_of,
+)
 from terrain.discrepancy.health.fault import Change, Column, FaultKind, FaultStatus, repaired
 from terrain.discrepancy.health.faults import faults_of
-from terrain.discrepancy.health.offsets import constant_of
-from terrain.discrepancy.health.readings import reading_of
+from terrain.discrepancy.health.readings import Reading, reading_of, turned_fault
 from terrain.discrepancy.health.response import odd_runs, stalled_runs
 from terrain.discrepancy.health.sessions import faulty_runs
 from terrain.discrepancy.health.unfit import clocks_of, unfit_runs
@@ -630,8 +639,8 @@ def test_an_offset_is_not_beyond_what_was_measured_and_not_where_the_heading_has
     assert not [f for f in faults(on_one_clock([both(run) for run in runs])) if f.change.kind is OFFSET]
     (rows,), _ = rows_and_low_pass(on_one_clock(sound()[1:2]), simulation_of(HUSKY))
     far = rows._replace(predicted=rows.predicted + 5.0)  # never near rest
-    assert np.isnan(constant_of(far, G)).all()
-    assert np.isfinite(constant_of(rows, G)).all()
+    assert np.isnan(zero_of(far, G)).all()
+    assert np.isfinite(zero_of(rows, G)).all()
 
 
 def test_an_offset_that_each_half_of_the_runs_has_otherwise_is_no_fault_of_the_logger():
@@ -660,6 +669,138 @@ def test_wheels_faster_than_their_motors_are_in_another_unit_also_without_a_spee
     assert likeliest(logs, options, HUSKY, 0.9) == ((), [])
     changes, rivals = likeliest(logs, options, HUSKY, 3.2)
     assert {change.column for each in (changes, *rivals) for change in each} == {Column.WHEELS}
+
+
+# -- Zeros and scales beside a witness -----------------------------------------------------------------------
+
+
+def steady_turns(rates_radps, n=12, duration_s=8.0):
+    """Return runs with a lidar, each of one steady turn, whose body turns less than its wheels say."""
+    noise, runs = spread_numbers("noise"), []
+    for i in range(n):
+        twist = np.tile([0.4, 0.0, rates_radps[i % len(rates_radps)]], (round(duration_s * 50) + 1, 1))
+        about = {"effects": WIDE, "run_id": f"turn_{i:02d}", "noise": noise}
+        run = simulate(HUSKY, twist, Ground(), i, **about)
+        streams = {  # without the start from rest
+            name: Stream(was.time_s[was.time_s > 2.0], was.values[was.time_s > 2.0], was.channels)
+            for name, was in run.streams.items()
+        }
+        runs.append(with_lidar(replace(run, streams=streams), 0.0))
+    return runs
+
+
+SIDES, ONE_SIDE = (0.8, -0.6, 0.5, -0.9), (0.7,)
+
+
+def test_an_offset_of_steady_turns_is_found_beside_the_heading_and_is_no_turned_sign():
+    runs = steady_turns(SIDES)
+    (fault,) = faults(on_one_clock([of_gyro(lambda _, w: w + 0.9)(run) for run in runs]))
+    assert (fault.change.kind, fault.change.column) == (OFFSET, Column.GYRO)
+    assert fault.change.offset == pytest.approx(-0.9, abs=0.05)
+    assert len(fault.run_ids) == len(runs)  # also those whose zero the wheels do not show
+    assert faults(on_one_clock(runs)) == ()
+
+
+def test_a_turned_sign_of_one_steady_turn_may_be_an_offset_and_of_two_is_a_sign():
+    one, two = (
+        on_one_clock([of_gyro(times(-1))(run) for run in steady_turns(rates)]) for rates in (ONE_SIDE, SIDES)
+    )
+    (fault,) = faults(one)
+    assert (fault.change.column, fault.status) == (Column.GYRO, FaultStatus.UNDECIDED)
+    assert [rival.kind for rival in fault.rivals] == [OFFSET]
+    assert "steady as the motion is" in fault.sentence
+    for run in repaired(one, [fault]):
+        assert np.isnan(run.measured[:, G]).all()
+    (fault,) = faults(two)
+    assert (fault.change.kind, fault.change.column, fault.status) == (
+        SIGN,
+        Column.GYRO,
+        FaultStatus.CONFIRMED,
+    )
+
+
+def test_a_channel_follows_about_its_zero_where_that_is_beyond_any_sensors():
+    (run,), _ = rows_and_low_pass(on_one_clock(sound()[1:2]), simulation_of(HUSKY))
+    moved = run.measured.copy()
+    moved[:, G] += 0.9
+    was, now = (agreement_of([each]) for each in (run, run._replace(measured=moved)))
+    assert now.correlation[0, G] == pytest.approx(was.correlation[0, G], abs=0.05)
+    assert now.gain[0, G] == pytest.approx(was.gain[0, G], rel=0.1)
+
+
+@pytest.mark.parametrize(("factor", "is_fault"), [(1.15, True), (0.87, True), (1.04, False), (1.0, False)])
+def test_a_scale_of_the_gyro_beside_the_heading_is_named_beyond_that_of_any_sensor(factor, is_fault):
+    runs = [with_lidar(run, 0.16) for run in runs_of(12, 0.1)]
+    signals = on_one_clock([of_gyro(times(factor))(run) for run in runs])
+    found = faults(signals)
+    assert [(fault.change.kind, fault.change.column) for fault in found] == (
+        [(FaultKind.SCALE, Column.GYRO)] if is_fault else []
+    )
+    for fault in found:
+        assert fault.change.factor == pytest.approx(1.0 / factor, rel=0.03)
+        assert fault.sentence.startswith("the gyro reads 1")
+        assert "too much" in fault.sentence if factor > 1.0 else "too little" in fault.sentence
+
+
+def test_a_zero_that_drifts_over_the_runs_is_named_and_taken_off_in_their_order():
+    runs = [with_lidar(run, 0.0) for run in runs_of(24, 0.1)]
+    drifts = [of_gyro(lambda _, w, k=k: w + 0.01 * k)(run) for k, run in enumerate(runs)]
+    signals = [replace(run, place=float(k)) for k, run in enumerate(on_one_clock(drifts))]
+    (fault,) = faults(signals)
+    assert (fault.change.kind, fault.change.column) == (FaultKind.DRIFT, Column.GYRO)
+    assert fault.change.over_runs == pytest.approx(-0.01, rel=0.1)
+    assert "from run to run in all 24 runs" in fault.sentence
+    for run, true in zip(repaired(signals, [fault]), on_one_clock(runs), strict=True):
+        assert_allclose(run.measured[:, G], true.measured[:, G], atol=0.03)
+    shuffled = [
+        of_gyro(lambda _, w, k=k: w + 0.01 * k)(run) for k, run in zip([5, 17, 11] * 8, runs, strict=True)
+    ]
+    assert faults(on_one_clock(shuffled)) == ()
+
+
+def test_a_reading_that_gains_more_in_a_half_of_the_runs_that_one_mends_may_lose_in_the_rest():
+    """Where both wheels turn alike, all wheels turned look like one that is; where they differ, they do not."""
+    one, every = Change(SIGN, Column.WHEELS, -1.0, 0), Change(SIGN, Column.WHEELS, -1.0)
+    correlation = np.zeros((8, len(CHANNELS)))
+    correlation[:4, G], correlation[4:, G] = 0.1, 0.99
+    before = Agreement(correlation, 0.0 * correlation, correlation)
+    gains = {one: [100.0] * 4 + [0.0] * 4, every: [80.0, 110.0, 80.0, 110.0] + [-500.0] * 4}
+    mends = np.arange(8) < 4
+
+    def tried(change, _):
+        gain = np.array(gains.get(change, [0.0] * 8))
+        return Reading(change, correlation, gain, mends & (gain > 0), gain > 0)
+
+    rows, _ = rows_and_low_pass(on_one_clock(sound()[1:2]), simulation_of(HUSKY))
+    runs = [rows[0]._replace(run_id=f"run_{i}") for i in range(8)]
+    fault = turned_fault(before, tried, runs, ["a"] * 8, HUSKY)
+    assert fault is not None
+    assert fault.change == one
+
+
+def test_where_a_robot_drives_sideways_the_vector_of_its_speed_follows_the_wheels():
+    """Either speed alone may be too small to ask for, and has the same sign in many directions."""
+    (run,), _ = rows_and_low_pass(on_one_clock(sound("agrimaro")[:1]), simulation_of(AGRIMARO))
+    predicted = np.zeros_like(run.predicted)
+    predicted[:, [X, Y]] = 0.05, 0.03
+    for turn_rad in (0.0, 1.0, np.pi):
+        measured = np.full_like(predicted, np.nan)
+        cos, sin = np.cos(turn_rad), np.sin(turn_rad)
+        measured[:, [X, Y]] = 0.8 * predicted[:, [X, Y]] @ np.array([[cos, sin], [-sin, cos]])
+        follows = agreement_of([run._replace(measured=measured, predicted=predicted)], sideways=True)
+        assert follows.correlation[0, X] == pytest.approx(cos)
+        assert follows.gain[0, X] == pytest.approx(0.8 * cos)
+    assert agreement_of([run._replace(measured=measured, predicted=predicted)]).correlation[0, X] == 0.0
+
+
+def test_a_channel_that_holds_its_largest_value_is_not_at_the_end_of_a_range_where_others_end_elsewhere():
+    def held_at_most(t, w):
+        at = int(np.argmax(np.where((t > 5) & (t < 20), w, -np.inf)))
+        return np.where((t >= t[at]) & (t < t[at] + 5), w[at], np.minimum(w, w[at]))
+
+    runs = [of_gyro(held_at_most)(run) if i in (1, 2, 3) else run for i, run in enumerate(sound())]
+    found = faults(on_one_clock(runs))
+    assert {fault.change.kind for fault in found} == {FaultKind.DROPOUT}
 
 
 # -- Measured logs: no fault, wheels and lidar of one robot that are late, runs of another that are stuck -----
