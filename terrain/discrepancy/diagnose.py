@@ -226,7 +226,7 @@ def find_causes(
         info = problem.at(fit.info.origin).counted_from(start.vector)
         fit = _withdraw_wrong(problem, refit(problem, info, again), withdrawn)
     fit = _withdraw_varying(problem, fit, varies, withdrawn)
-    fit = pooled(problem, fit._replace(rivals=rivals_of(problem, fit.info, start, fit.causes)))
+    fit = _likeliest(problem, fit, start, withdrawn)
     by_id = {run.run_id: run for run in repaired(signals, faults)}
     unlike = [by_id[run.run_id] for run in excluded if run.reason.startswith(UNLIKE)][:MAX_UNLIKE]
     named_in = {run.run_id: constancy.rogues_among(problem, fit, [run]) for run in unlike}
@@ -255,7 +255,7 @@ def judged(found: Found, on: HeldOut) -> tuple[Found, Judgement]:
         problem, withdrawn = found.problem, dict(found.withdrawn)
         fit = _withdraw(problem, found.fit, worst, judgement.reasons[worst.name], withdrawn)
         fit = _withdraw_wrong(problem, fit, withdrawn)
-        fit = pooled(problem, fit._replace(rivals=rivals_of(problem, fit.info, found.start, fit.causes)))
+        fit = _likeliest(problem, fit, found.start, withdrawn)
         found = found._replace(fit=fit, withdrawn=withdrawn)
 
 
@@ -286,7 +286,7 @@ def statement_of(found: Found, judgement: Judgement) -> verdict.Diagnosis:
     built = found.built_in
     values = {cause.name: values_of(fit, cause) for cause in fit.causes}
     for rivals in fit.rivals.values():
-        for name, (change, error, _) in rivals.items():
+        for name, (change, error, *_) in rivals.items():
             values.setdefault(name, _values(effect_named(name), change, error))
     parameters = names_of(built)
     at = [fit.names.index(name) for name in parameters]
@@ -452,6 +452,36 @@ def _withdraw(
     withdrawn[cause.name] = cause_of(problem, fit, cause, reason)
     others = [other for other in fit.causes if other is not cause and other.modifies != cause.name]
     return refit(problem, fit.info, others)._replace(pairs=fit.pairs)
+
+
+def _likeliest(
+    problem: Problem, fit: CauseFit, start: Evidence, withdrawn: Mapping[str, verdict.Cause]
+) -> CauseFit:
+    """Return the causes with their rivals, of each set the member of greatest posterior by evidence and size.
+
+    What the evidence hardly distinguishes the plausible sizes may: a wheel radius 10 % off is stranger than wheels that
+    slip by 10 %.  A member that something speaks against in the place of the cause does not take it.
+    """
+    fit, tried = fit._replace(rivals=rivals_of(problem, fit.info, start, fit.causes)), {*withdrawn}
+    tried |= {cause.name for cause in fit.causes}
+    while True:
+        ahead = [
+            (rival.behind, name, cause)
+            for cause in fit.causes
+            for name, rival in fit.rivals[cause.name].items()
+            if rival.behind < 0.0 and name not in tried
+        ]
+        if not ahead:
+            return pooled(problem, fit)
+        _, name, cause = min(ahead, key=lambda swap: swap[0])
+        tried.add(name)
+        swapped = [effect_named(name) if own is cause else own for own in fit.causes]
+        other = refit(problem, fit.info, swapped)
+        if len(other.causes) == len(swapped) and not (
+            {*reasons_to_withdraw(problem, other, _probes(problem, other))}
+            - {*reasons_to_withdraw(problem, fit, _probes(problem, fit))}
+        ):
+            fit = other._replace(pairs=fit.pairs, rivals=rivals_of(problem, other.info, start, other.causes))
 
 
 def _probes(problem: Problem, fit: CauseFit) -> dict[tuple[str, str], ProbeResult]:

@@ -21,7 +21,7 @@ from terrain.discrepancy.evidence import (
     whiten_run,
 )
 from terrain.discrepancy.runs import LowPass, Signals, Simulation, rows_of
-from terrain.effects import BOUNDS, INDEX, PARAMETERS, Effect
+from terrain.effects import BOUNDS, INDEX, PARAMETER, PARAMETERS, Effect
 from terrain.records import Array
 
 # -- A problem: runs and a simulation; and nonlinear fits of parameters to all of them ---------------------
@@ -177,6 +177,9 @@ else, and is no rival, however little worse it fits."""
 PLAUSIBLE_STDS = 2.36
 """Standard deviations by which a rival may be beyond its plausible range: the half of a 95 % interval."""
 
+PLAUSIBLE_QUANTILE = 1.96
+"""Standard deviations of the prior of a parameter from 0, as described, to the end of its plausible range."""
+
 
 class Rival(NamedTuple):
     """The fit of an effect in the place of a cause."""
@@ -184,6 +187,26 @@ class Rival(NamedTuple):
     change: Array  #: (k,) of its parameters
     std: Array
     others: Mapping[str, float]  #: changes of the parameters of the other causes beside it
+    behind: float  #: minus twice the logarithm of its posterior over that of the cause
+
+
+def surprise(vector: Array, names: Sequence[str]) -> float:
+    """Return minus twice the logarithm of the prior of parameters at a point, of each in units of its range.
+
+    The prior is normal about 0, as the description has it; its 95 % interval on either side is the plausible range.
+    Values are counted over that range, so that the priors of different parameters are one.
+
+    Examples
+    --------
+    >>> from terrain.effects import vector_of
+    >>> point = vector_of({"wheel_radius_ratio": -0.1, "ground_slip_ratio": 0.1})
+    >>> [round(surprise(point, [name]), 2) for name in ("wheel_radius_ratio", "ground_slip_ratio")]
+    [3.84, 0.15]
+    """
+    value = vector[[INDEX[name] for name in names]]
+    low, high = np.array([PARAMETER[name].plausible for name in names]).reshape(-1, 2).T
+    end = np.maximum(np.where(value < 0.0, -low, high), 1e-9)
+    return float(((PLAUSIBLE_QUANTILE * value / end) ** 2).sum())
 
 
 Rivals = Mapping[str, Rival]
@@ -198,7 +221,8 @@ def rivals_of(
     It is compared by the noise that the causes leave and by that of the simulation as it is given: a cause
     that absorbs noise is ahead by only one of them.  Where runs disagree on a cause by more than the noise
     allows, losses count that much less, as a quasi-likelihood has them.  Where much is wrong, neither is a
-    likelihood: a rival that leaves a larger square than the noise of the wheels can make is none.
+    likelihood: a rival that leaves a larger square than the noise of the wheels can make is none.  The best of them
+    is the measure, where that is not the cause.
     """
     runs_alone = replace(info, model_std=np.zeros_like(info.model_std))  # in what all runs have they agree
     own: list[tuple[float, Evidence]] = []  # the causes by both judges, where anything comes near
@@ -214,7 +238,8 @@ def rivals_of(
             behind = min(fits[0][0] - own[0][0], fits[1][0] - own[1][0]) / inflation
             here, square = fits[0][1], float(own[0][1].c[0])
             worse = float(here.c[0]) > (1.0 + RIVAL_RISE) * square + RIVAL_LOSS * inflation
-            if not worse and behind < (TWIN_LOSS if alike > TWIN else RIVAL_LOSS):
+            most = TWIN_LOSS if alike > TWIN else RIVAL_LOSS
+            if not worse and behind < most:
                 its = [p.name for p in effect.parameters]
                 at, places = [INDEX[name] for name in its], here.places(its)
                 std = np.sqrt(np.maximum(np.diag(here.fit(swapped)[1]), 0.0))[places]
@@ -222,11 +247,12 @@ def rivals_of(
                 if all(p.is_plausible(*own) for p, own in zip(effect.parameters, ends.T, strict=True)):
                     moved = dict(zip(PARAMETERS, (here.vector - info.vector).tolist(), strict=True))
                     beside = {name: moved[name] for name in names_of(others)}
-                    as_good.append(
-                        (behind, effect.name, Rival(here.vector[at] - info.vector[at], std, beside))
-                    )
+                    less = surprise(own[0][1].vector, names_of(causes)) - surprise(here.vector, swapped)
+                    rival = Rival(here.vector[at] - info.vector[at], std, beside, behind - less)
+                    as_good.append((behind, most, effect.name, rival))
+        best = min([0.0, *[behind for behind, *_ in as_good]])
         as_good.sort(key=lambda rival: rival[0])
-        rivals[cause.name] = {name: rival for _, name, rival in as_good}
+        rivals[cause.name] = {name: rival for behind, most, name, rival in as_good if behind - best < most}
     return rivals
 
 

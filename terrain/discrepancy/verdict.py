@@ -235,7 +235,7 @@ class Diagnosis:
     faults: tuple[Fault, ...] = ()  #: of channels, which were repaired before anything was compared
     by_session: tuple[BySession, ...] = ()  #: values of the named causes; empty where runs are of one session
     candidates: tuple[Cause, ...] = ()  #: the strongest evidence first
-    of_sets: tuple[Cause, ...] = ()  #: of each set the effect that is built in, which fits best
+    of_sets: tuple[Cause, ...] = ()  #: of each set the effect that is built in, the likeliest
     channels: tuple[ChannelVerdict, ...] = ()
     gain: Gain | None = None  #: on data held out
 

@@ -230,7 +230,10 @@ def test_an_effect_that_is_little_behind_is_a_rival(monkeypatch, behind, square,
     monkeypatch.setattr(search_module, "wald_test", lambda *_: SimpleNamespace(inflation=inflation))
     rivals = rivals_of(None, info, start, [cause])[cause.name]
     assert list(rivals) == [other.name] * is_rival
-    assert all((change[0], std[0]) == pytest.approx((0.1, 0.01)) for change, std, _ in rivals.values())
+    # its size counts beside the evidence: a motor constant of 0.1, where 0.5 is plausible, beside no payload
+    expected = pytest.approx(behind / inflation + (1.96 * 0.2) ** 2)
+    assert all(rival.behind == expected for rival in rivals.values())
+    assert all((change[0], std[0]) == pytest.approx((0.1, 0.01)) for change, std, *_ in rivals.values())
 
 
 @pytest.mark.parametrize(
