@@ -179,7 +179,7 @@ def channels_that_matter(result: ExplainResult) -> list[ChannelVerdict]:
 def answer_of(result: ExplainResult) -> str:
     """Return what is wrong and what that is worth, in one sentence in the words of who built the robot."""
     robot, channels = result.diagnosis.robot, channels_that_matter(result)
-    learned = [gain for gain in result.diagnosed.learned_gains if gain.is_kept]
+    learned = [gain for gain in result.diagnosed.learned_gains if gain.reduction > gain.named_reduction]
     if not channels and learned:
         says, removes = learned[0].says, percent_text(learned[0].reduction)
         of = f"the squared error of the {CHANNEL_WORDS[learned[0].channel][0]}"
@@ -374,7 +374,7 @@ def _learned_parts(diagnosed: DiagnosedRuns) -> Iterator[Part]:
             continue
         cells: tuple[Any, ...] = (None, None, each.inner_gain, each.reference_gain, "cross-validated")
         if (gain := judged.get(channel)) is not None:
-            remark = "" if gain.is_kept else "worse on held-out runs, left out"
+            remark = "" if gain.reduction > gain.named_reduction else "no better on held-out runs"
             cells = gain.named_reduction, gain.ci, gain.reduction, gain.learner_reduction, remark
         rows.append((CHANNEL_WORDS[channel][0], each.term.says, *cells))
     if rows:

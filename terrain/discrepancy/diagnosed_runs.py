@@ -139,22 +139,14 @@ def diagnose_runs(
     gains: tuple[LearnedGain, ...] = ()
     with_terms, whole, whole_gain = last.with_learned(kept_terms(learned)), judgement.runs, judgement.gain
     if with_terms is not last and not on.in_turn:
-
-        def beside(extension: Simulation) -> tuple[ComparedRun, ...]:
-            pairs = zip(on.plain, on.signals, strict=True)
-            return tuple(beside_extended(run, own, extension, problem.low_pass) for run, own in pairs)
-
-        whole = beside(with_terms)
-        gains = learned_gains(learned, judgement.runs, on.gain(whole), whole, seed)
-        if len(kept_terms(learned, gains)) < len(kept_terms(learned)):
-            with_terms = last.with_learned(kept_terms(learned, gains))
-            whole = beside(with_terms)
+        pairs = zip(on.plain, on.signals, strict=True)
+        whole = tuple(beside_extended(run, own, with_terms, problem.low_pass) for run, own in pairs)
         whole_gain = on.gain(whole)
-    behind, kept = {run.run_id for run in problem.signals}, with_terms.learned[len(last.learned) :]
+        gains = learned_gains(learned, judgement.runs, whole_gain, whole, seed)
+    behind = {run.run_id for run in problem.signals}
     extension = None if with_terms is simulation else with_terms
     compared = compare_runs(simulation, extension, problem.signals, problem.low_pass)
-    built = {name: each for name, each in learned.items() if each.term in kept}
-    left = left_out_residuals(compared, problem.signals, info, diagnosis.covariance.parameters, built)
+    left = left_out_residuals(compared, problem.signals, info, diagnosis.covariance.parameters, learned)
     return DiagnosedRuns(
         diagnosis=diagnosis,
         simulation=simulation,

@@ -11,7 +11,9 @@ of a dictionary are selected one after the other, by what each takes off the squ
 least squares: Chen, Billings and Luo, Int. J. Control 1989).  How many there are is decided by cross-validation over
 sessions, or runs where there are few: the fewest whose error is within one standard error of the least (Breiman et
 al., Classification and Regression Trees, 1984, 3.4.3), or as many as have the least where the fewest do not reach
-:data:`ENOUGH` of the black-box reference in the same folds.  None is the answer where none is within it.
+:data:`ENOUGH` of the black-box reference.  None is the answer where none is within it, where none gains clearly, or
+where two sessions are there and the term of each does not gain in the other.  Runs held out decide
+nothing of a term.
 """
 
 from __future__ import annotations
@@ -171,7 +173,8 @@ def learn_terms(
     steps_inputs = [term_inputs(run, simulation, low_pass) for run in runs]
     every = np.concatenate([inputs for _, inputs in steps_inputs])
     ranges = driven_ranges([inputs for _, inputs in steps_inputs])
-    references = _reference_errors(compared, groups)
+    folds = folds_of(runs, groups)
+    references = _reference_errors(compared, folds)
     residuals = [left_by(simulation, run, low_pass) for run in runs]
     known: dict[tuple[str, ...], list[Array]] = {}  # of the last dictionary: those of motion are one
     for channel in ORDER:
@@ -202,6 +205,7 @@ def learn_terms(
         n = size_of(errors, (1.0 - ENOUGH) * before + ENOUGH * reference)
         by_chance = CHANCE / len(runs) * float(scatter[c])
         n = n if errors[:, 0].sum() - errors[:, n].sum() > by_chance else 0
+        n = n if left_out_gain(np.array([gram for gram, _ in grams]), folds, n) > 0.0 else 0
         sizes = np.concatenate([noise.size(run.pace_mps)[:, c] for run in compared])
         noise_std = float(np.sqrt(np.nanmean(sizes**2)))
         left_std = math.sqrt(max(float(errors[:, n].sum()) / n_rows - noise_std**2, 0.0))
@@ -238,14 +242,9 @@ def scatter_square(info: Evidence) -> Array:
     )
 
 
-def kept_terms(learned: Mapping[str, Learned], gains: Sequence[LearnedGain] = ()) -> tuple[LearnedTerm, ...]:
-    """Return the terms that are built into an extended robot.
-
-    Where no run was held out, cross-validation alone decides.
-    """
-    worse = {gain.channel for gain in gains if not gain.is_kept}
-    terms = [each.term for name, each in learned.items() if name not in worse]
-    return tuple([term for term in terms if term is not None])
+def kept_terms(learned: Mapping[str, Learned]) -> tuple[LearnedTerm, ...]:
+    """Return the terms that are built into an extended robot."""
+    return tuple([each.term for each in learned.values() if each.term is not None])
 
 
 class LearnedGain(NamedTuple):
@@ -257,8 +256,6 @@ class LearnedGain(NamedTuple):
     reduction: float  #: that both remove
     ci: Interval  #: 95 % interval of what the term adds to that
     learner_reduction: float  #: that the black-box learner removes
-    #: whether it is built into the extended robot: a term that makes held-out runs worse is not
-    is_kept: bool
 
 
 def learned_gains(
@@ -284,7 +281,7 @@ def learned_gains(
         added, ci = removed.gain(np.array([name == shown for name in CHANNELS], dtype=float), seed)
         of = both.channels[shown]
         about = of.reduction - added, of.reduction, ci, of.learner_reduction
-        gains.append(LearnedGain(shown, each.term.says, *about, added > 0.0))
+        gains.append(LearnedGain(shown, each.term.says, *about))
     return tuple(gains)
 
 
@@ -294,6 +291,30 @@ def groups_of(runs: Sequence[Signals], seed: int) -> Array:
     if len(sessions) >= MIN_GROUPS:
         return np.array([sessions.index(run.session) for run in runs]) % MAX_GROUPS
     return np.random.default_rng(seed).permutation(len(runs)) % MAX_GROUPS
+
+
+def folds_of(runs: Sequence[Signals], groups: Array) -> Array:
+    """Return the fold (runs,) of each run: its session where there are two, too few to be groups, else of groups."""
+    sessions = sorted({run.session for run in runs})
+    if len(sessions) == 2:
+        return np.array([sessions.index(run.session) for run in runs])
+    return groups % REFERENCE_FOLDS
+
+
+def left_out_gain(grams: Array, folds: Array, n: int) -> float:
+    """Return by how much ``n`` products, selected and fitted without them, reduce the square of folds.
+
+    Parameters
+    ----------
+    grams : (runs, p + 1, p + 1) sums of products of each run, of the residual last
+    folds : (runs,)
+    """
+    total, gain = grams.sum(axis=0), 0.0
+    for fold in np.unique(folds):
+        own = grams[folds == fold].sum(axis=0)
+        x = _weights(total - own, n)
+        gain += float(2.0 * x @ own[:-1, -1] - x @ own[:-1, :-1] @ x)
+    return gain
 
 
 def dictionary(inputs: Array, channel: str) -> tuple[str, ...]:
@@ -428,7 +449,11 @@ def cross_validated(sums: Array) -> Array:
 
 
 def size_of(errors: Array, enough: float) -> int:
-    """Return how many products a term has, by errors (groups, sizes) of the cross-validation."""
+    """Return how many products a term has, by errors (groups, sizes) of the cross-validation.
+
+    Where a few groups have most of the error, those of the fewest within a standard error may not gain clearly, which
+    more of them do.
+    """
     total, freedom = errors.sum(axis=0), len(errors) - 1
     best = int(np.argmin(total))
 
@@ -439,16 +464,21 @@ def size_of(errors: Array, enough: float) -> int:
         scatter = ((apart - ratio * errors[:, [0]]) ** 2).sum(axis=0) * (1.0 + 1.0 / freedom)
         return ratio, np.sqrt(scatter) / total[0]
 
+    def is_clear(n: int) -> bool:
+        more, error = gains(n)
+        return bool(more[0] > student.ppf(LEVEL, freedom) * error[0])
+
     more, error = gains(best)
-    few = int(np.argmax(more <= error))
-    n = best if few and total[few] > enough else few
-    more, error = gains(n)
-    return n if more[0] > student.ppf(LEVEL, freedom) * error[0] else 0
+    within = np.flatnonzero(more <= error).tolist()
+    if not within[0]:
+        return 0
+    few = next((n for n in within if is_clear(n)), 0)
+    return best if few and total[few] > enough and is_clear(best) else few
 
 
-def _reference_errors(compared: Sequence[ComparedRun], groups: Array) -> Array:
-    """Return the squared error (channels,) of the black-box reference, in folds of whole groups."""
-    fold, errors = groups % REFERENCE_FOLDS, np.zeros(len(CHANNELS))
+def _reference_errors(compared: Sequence[ComparedRun], fold: Array) -> Array:
+    """Return the squared error (channels,) of the black-box reference, in folds (runs,)."""
+    errors = np.zeros(len(CHANNELS))
     for k in np.unique(fold):
         inside = [run for run, own in zip(compared, fold, strict=True) if own == k]
         others = [run for run, own in zip(compared, fold, strict=True) if own != k]

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from terrain.discrepancy.learner import (
     DRIVEN,
     cross_validated,
     fitted,
+    folds_of,
     learn_terms,
+    left_out_gain,
     predicted_residuals,
     scatter_square,
     size_of,
@@ -116,6 +119,24 @@ def test_a_residual_that_few_products_do_not_reach_gets_as_many_as_have_the_leas
     errors = np.tile([10.0, 2.0, 1.0, 0.9], (8, 1)) + 0.3 * np.random.default_rng(0).standard_normal((8, 4))
     errors[:, 3] = errors[:, 2] - 0.1 + 0.4 * np.resize([1.0, -1.0], 8)
     assert (size_of(errors, math.inf), size_of(errors, 0.0)) == (2, 3)
+
+
+def test_the_fewest_that_gain_clearly_are_selected_where_fewer_fail_in_some_groups():
+    errors = np.tile([10.0, 1.0, 2.0], (12, 1))
+    errors[:2, 1] = 19.0  # within a standard error of the least, and not clearly better than none
+    assert (size_of(errors[:, :2], math.inf), size_of(errors, math.inf)) == (0, 2)
+
+
+@pytest.mark.parametrize(("other", "gains"), [(0.5, True), (-0.3, False)])
+def test_of_two_sessions_the_term_of_each_has_to_gain_in_the_other(other, gains):
+    """Runs of both, mixed, would show a level in each session as a law of them all."""
+    rng, sessions = np.random.default_rng(0), ["a", "b"] * 8
+    sums = [sums_of(rng, np.array([{"a": 0.5, "b": other}[name], 0.0, 0.0]), 1)[0] for name in sessions]
+    runs, mixed = [SimpleNamespace(session=name) for name in sessions], np.arange(16) // 2
+    folds = folds_of(runs, mixed)
+    assert len(np.unique(folds)) == 2
+    assert (left_out_gain(np.array(sums), folds, 1) > 0.0) == gains
+    assert len(np.unique(folds_of([SimpleNamespace(session="")] * 16, mixed))) == 4
 
 
 def test_what_runs_differ_by_at_random_is_no_law_of_them(hide, pose):
