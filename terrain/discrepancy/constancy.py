@@ -31,7 +31,7 @@ from terrain.discrepancy.evidence import (
 from terrain.discrepancy.patterns import MIN_GROUP, SCATTERS, Kind, Pattern, pattern_of
 from terrain.discrepancy.robot_terms import value_in_robot_terms, values_with_intervals
 from terrain.discrepancy.runs import UNLIKE, Excluded, Signals
-from terrain.discrepancy.search import RIVAL_LINEAR, RIVAL_LOSS, CauseFit, Problem, cause_fit
+from terrain.discrepancy.search import RIVAL_LINEAR, RIVAL_LOSS, CauseFit, Problem, cause_fit, names_of
 from terrain.effects import BOUNDS, CHANNELS, INDEX, PARAMETER, Effect
 from terrain.records import Array
 from terrain.robots import Robot
@@ -301,6 +301,15 @@ class RunValues(NamedTuple):
         """Evidence that runs differ, as a standard normal number."""
         return max(self.z, self.pattern.z if self.pattern else 0.0)
 
+    @property
+    def mean(self) -> float:
+        """Mean value by information."""
+        return float(np.average(self.value, weights=self.weight))
+
+    def about(self, mean: float) -> RunValues:
+        """Return the same about another mean."""
+        return self._replace(value=self.value + mean - self.mean)
+
     def in_pattern(self, signals: Sequence[Signals]) -> RunValues:
         """Return the same with the pattern of the values of these runs."""
         place, of = (
@@ -341,19 +350,22 @@ def varying_effects(problem: Problem, fit: CauseFit) -> tuple[verdict.Varying, .
         return ()
     # what was assumed of a parameter is no news, other than what was estimated
     least = {name: known.get(name, 0.0) or LEAST_RATIO * PRIOR_STD[name] for name in info.scatter}
+    # what all runs have in common is not asked: the whole library is freed, and values are about those of the fit
+    common = np.linalg.solve(info.freed, info.g.sum(axis=0))
     tried = []
     for effect in problem.library:
-        runs = [
-            values_by_run(info, p.name, fit.names, fit.change, least, known.get(p.name, 0.0))
-            for p in effect.parameters
-        ]
-        tried.append(_OwnValues(effect, [own.in_pattern(problem.signals) for own in runs], 0.0, 0.0))
+        values = []
+        for name in names_of([effect]):
+            its = least, known.get(name, 0.0)
+            mean = values_by_run(info, name, fit.names, fit.change, *its).mean
+            values.append(values_by_run(info, name, info.names, common, *its).about(mean))
+        tried.append(_OwnValues(effect, [each.in_pattern(problem.signals) for each in values], 0.0, 0.0))
     most = max(tried, key=lambda own: own.clearest.evidence)
     if not most.clearest.evidence > Z_VARIES:
         return ()
     pattern = max([own.clearest.pattern for own in tried], key=lambda found: found.z if found else 0.0)
     columns = pattern.columns[:, 1:] if pattern and pattern.z > Z_VARIES else np.zeros((len(info.rows), 0))
-    tried = [_own_values(fit, info, own, known, columns) for own in tried if own.clearest.evidence > Z_NEAR]
+    tried = [_own_values(info, own, known, columns) for own in tried if own.clearest.evidence > Z_NEAR]
     first = min(tried, key=lambda own: own.loss)
     behind = max(RIVAL_LINEAR, NEAR_RATIO * first.gain)
     near: list[tuple[_OwnValues, _OwnValues]] = []
@@ -361,27 +373,28 @@ def varying_effects(problem: Problem, fit: CauseFit) -> tuple[verdict.Varying, .
         if linear.loss > first.loss + behind:
             continue
         # by a nonlinear fit: sensitivities of each run at its own values
-        own, names = linear, tuple(dict.fromkeys([*fit.names, *[runs.name for runs in linear.runs]]))
+        own = linear
         for _ in range(N_STEPS):
-            values = {
+            at = {
                 runs.name: np.clip(info.vector[INDEX[runs.name]] + runs.value, *BOUNDS[runs.name])
                 for runs in own.runs
             }
-            there = problem.at(info.origin, names, noise=info.noise, scatter=info.scatter, own=values)
-            own = _own_values(fit, there.counted_from(info.vector), own, known, columns)
+            there = problem.at(info.origin, info.names, noise=info.noise, scatter=info.scatter, own=at)
+            own = _own_values(there.counted_from(info.vector), own, known, columns)
         own = own._replace(runs=[runs.in_pattern(problem.signals) for runs in own.runs])
         of = own.clearest
-        (low, high), seen = PARAMETER[of.name].plausible, of.weight > 0
+        (low, high), seen = BOUNDS[of.name], of.weight > 0
         value = info.vector[INDEX[of.name]] + of.value[seen]
         margin = OUT_STDS / np.sqrt(of.weight[seen]) + OUT_SCATTERS * of.scatter
-        believed = PARAMETER[of.name].plausible
-        inside = True
+        # parts of the runs are apart by what a builder would believe; what is wrong in all of them is in their mean
+        apart = np.ptp(of.pattern.values[seen]) if columns.size and of.pattern is not None else 0.0
+        believed = apart <= np.ptp(PARAMETER[of.name].plausible)
+        # values of runs by themselves may have a pattern that runs together do not confirm
         if (
-            columns.size and of.pattern is not None
-        ):  # parts of the runs are of a size that a builder would believe
-            parts = info.vector[INDEX[of.name]] + of.pattern.values[seen]
-            inside = bool(believed[0] <= parts.min() and parts.max() <= believed[1])
-        if inside and np.mean((value < low - margin) | (value > high + margin)) <= OUT_RATIO:
+            own.gain > RIVAL_LOSS
+            and believed
+            and np.mean((value < low - margin) | (value > high + margin)) <= OUT_RATIO
+        ):
             near.append((own, linear))
     if not near:
         return ()
@@ -397,7 +410,7 @@ def varying_effects(problem: Problem, fit: CauseFit) -> tuple[verdict.Varying, .
     if not max([own.clearest.evidence for own in alike]) > Z_VARIES:
         return ()
     of, rivals = best.clearest, tuple([own.effect.name for own in alike if own is not best])
-    name, mean = best.effect.name, float(np.average(of.value, weights=of.weight))
+    name, mean = best.effect.name, of.mean
     channel = CHANNELS[int(np.argmax(info.channel_power(np.eye(len(info.names))[info.places([of.name])])))]
     about = of.name.rpartition("_")[2], rivals, mean, of.scatter, of.evidence
     return (verdict.Varying(name, of.name, *about, *_in_words(of, problem.signals, channel, rivals)),)
@@ -439,15 +452,12 @@ def rogues_among(problem: Problem, fit: CauseFit, runs: Sequence[Signals]) -> tu
     return tuple(rogues)
 
 
-def _own_values(
-    fit: CauseFit, info: Evidence, tried: _OwnValues, known: Mapping[str, float], columns: Array
-) -> _OwnValues:
+def _own_values(info: Evidence, tried: _OwnValues, known: Mapping[str, float], columns: Array) -> _OwnValues:
     """Fit runs with values of their own of an effect, all else as it is assumed, from a scatter of its parameters.
 
     With the columns (runs, m) of a pattern, the effect has a value for each of these, and scatters about them.
     """
     own = [runs.name for runs in tried.runs]
-    names = tuple(dict.fromkeys([*fit.names, *own]))
     least = {
         name: known.get(name, 0.0) or LEAST_RATIO * PRIOR_STD[name]
         for name in [*[name for name in info.scatter if name not in own], *own]
@@ -465,14 +475,17 @@ def _own_values(
         first = k + j * columns.shape[1]
         design[:, place, first : first + columns.shape[1]] = columns
     gram = design.transpose(0, 2, 1) @ gram @ design
-    both = [*info.places(names), *range(k, design.shape[2] - 1)]
-    loss, shared, std = fit_mixed(gram, both, info.places([*least]), least_std, start, free)
-    alike = fit_mixed(
-        gram, info.places(names), info.places([*least]), least_std, least_std, np.zeros_like(free)
-    )[0]
+    random = info.places([*least])
+    # the whole library up to its prior, as one more run has it
+    prior = np.zeros((1, *gram.shape[1:]))
+    prior[0, :k, :k] = info.prior
+    gram, shared = np.concatenate([gram, prior]), range(design.shape[2] - 1)
+    loss, values, std = fit_mixed(gram, shared, random, least_std, start, free)
+    alike, *_ = fit_mixed(gram, range(k), random, least_std, least_std, np.zeros_like(free))
     varies = dict(zip(least, std.tolist(), strict=True))
     runs = [
-        values_by_run(info, name, names, shared[: len(names)], varies, known.get(name, 0.0)) for name in own
+        values_by_run(info, of.name, info.names, values[:k], varies, known.get(of.name, 0.0)).about(of.mean)
+        for of in tried.runs
     ]
     return _OwnValues(tried.effect, runs, loss, alike - loss)
 

@@ -5,9 +5,11 @@ Runs have values ``v_i`` with variances ``s_i^2`` by the noise.  A pattern is a 
     v = X b + e,   e_i ~ N(0, s_i^2 + t^2),
 
 and the scatter ``t`` of greatest likelihood.  Its evidence over one value of all runs is the likelihood ratio as an F
-statistic, which it is where the scatter is far above the noise, and which understates it elsewhere; the probability is
-multiplied by the number of patterns of its kind (Bonferroni), as two groups may be any.  The runs themselves show their
-scatter: what robots of a kind differ by from run to run is not asked.
+statistic; the probability is multiplied by the number of patterns of its kind (Bonferroni), as two groups may be any.
+Runs show their scatter themselves: what robots of a kind differ by from run to run is not asked.
+
+The likelihood is that of normal scatter, where two groups explain a skewed or a heavy tail.  So they need a gap that no
+law of one mode has: away from its mode a density falls, and runs beyond a gap are further apart.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from scipy.special import gammaln
 from scipy.stats import f as fisher
 from scipy.stats import t as student
 
-from terrain.discrepancy.evidence import z_of
+from terrain.discrepancy.evidence import TRUST_DOF, z_of
 from terrain.records import Array
 
 MIN_RUNS, MIN_SIDE, MIN_GROUP = 6, 3, 2
@@ -32,9 +34,8 @@ SCATTERS = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 40)])
 """Scatters that are tried, over the range of the values."""
 
 
-APART = 3.0
-"""Groups are apart by that times the scatter in either at the least: the tail of a law is no group, nor is half of a
-normal one: its halves are apart by 2.7."""
+GROUPS_P = 0.02
+"""Two values of runs are groups by less than that probability of such a gap in a law of one mode: either side of it."""
 
 ROGUE_TAIL_DOF, ROGUE_P = 4.0, 0.01
 """A rogue run is improbable even where runs scatter with Student's distribution of so many degrees, as measured ones
@@ -153,7 +154,7 @@ def evidence_of_parts(value: Array, variance: Array, second: Array) -> float:
 
 def _z_of_losses(none: float, own: float, n: int, n_columns: int, log_choices: float) -> float:
     """Return the evidence of a design of n runs over one value, as a standard normal number."""
-    more, dof, ratio = n_columns - 1, n - n_columns, max(none - own, 0.0) / n
+    more, dof, ratio = n_columns - 1, n + TRUST_DOF - n_columns, max(none - own, 0.0) / (n + TRUST_DOF)
     log_p = float(fisher.logsf(math.expm1(min(ratio, 500.0)) * dof / more, more, dof))
     # where that underflows: far out the tail falls with this power
     return z_of(min(max(log_p, -0.5 * dof * ratio - 50.0) + log_choices, 0.0))
@@ -167,19 +168,26 @@ def _is_apart(kind: Kind, value: Array, columns: Array, coefficients: Array, wei
         scatter = math.sqrt(float(np.mean(left[rest] ** 2)))
         size = change / max(scatter, 1.0 / math.sqrt(float(weight[~rest][0])))
         return 2.0 * len(value) * float(student.sf(size, ROGUE_TAIL_DOF)) < ROGUE_P
-    n = columns.sum(axis=0)
-    scatters = np.sqrt((columns * left[:, None] ** 2).sum(axis=0) / np.maximum(n - 1.0, 1.0))
-    return change > APART * float(scatters.max())
+    ends = [np.sort(value[of > 0]) for of in columns.T]
+    low, high = sorted(ends, key=lambda own: own[0])
+    gap = high[0] - low[-1]
+    # away from its one mode a density falls, and is no more than even from the gap on: of m runs there m - 1 lie
+    # within the range of these by chance
+    within = [float(np.ptp(own) / (gap + np.ptp(own))) ** (len(own) - 1) for own in ends]
+    return max(within) < GROUPS_P
 
 
 def _fit(value: Array, variance: Array, columns: Array) -> tuple[float, Array, Array, Array]:
-    """Return minus twice the log-likelihood of a design, its coefficients, their covariance, and the runs' weights."""
+    """Return minus twice the log-likelihood of a design, its coefficients, their covariance, and the runs' weights.
+
+    Variances are known up to a factor near 1, as of :data:`TRUST_DOF` values more: what is taken for noise of a run may
+    be common to all of them.
+    """
     weights = 1.0 / (variance + (SCATTERS[:, None] * np.ptp(value)) ** 2)
     covs = np.linalg.pinv(np.einsum("tn,ni,nj->tij", weights, columns, columns), hermitian=True)
     xs = np.einsum("tij,nj,tn->ti", covs, columns, weights * value)
-    losses = (weights * (value - xs @ columns.T) ** 2 - np.log(weights)).sum(axis=1)
+    squares, n = TRUST_DOF + (weights * (value - xs @ columns.T) ** 2).sum(axis=1), len(value) + TRUST_DOF
+    losses = n * np.log(squares) - np.log(weights).sum(axis=1)
     k = int(np.argmin(losses))
-    x, weight, dof = xs[k], weights[k], len(value) - columns.shape[1]
-    # of greatest likelihood, the scatter is too small by what was fitted
-    inflation = max(float(weight @ (value - columns @ x) ** 2) / dof, 1.0)
-    return float(losses[k]), x, covs[k] * inflation, weight
+    factor = squares[k] / (n - columns.shape[1])
+    return float(losses[k]), xs[k], covs[k] * factor, weights[k] / factor

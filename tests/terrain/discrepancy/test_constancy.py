@@ -24,6 +24,7 @@ from terrain.discrepancy.constancy import (
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.evidence import Evidence, grams_of
 from terrain.discrepancy.patterns import Kind
+from terrain.discrepancy.search import cause_fit
 from terrain.discrepancy.verdict import Tier
 from terrain.effects import PARAMETERS, effect_named
 from terrain.robots import load_robot
@@ -255,6 +256,16 @@ def test_a_tyre_that_loses_air_is_a_trend_in_its_size_and_one_rogue_run_is_named
     (out,) = rogue.excluded_runs
     assert (rogue.varying, out.run_id) == ((), with_rogue[3].run_id)
     assert "unlike the other 7 runs: its wheel radius differs from theirs by 8" in out.reason
+
+
+@pytest.mark.parametrize("common", [0.0, 1.5])
+def test_what_is_wrong_in_all_runs_does_not_decide_what_varies_between_them(hide, pose, common):
+    """A slip with force that no cause has yet: in one value of all runs, it would explain most."""
+    values = [{RADIUS: 0.06 * float(odd), "force_slip_ratio": common} for odd in ODD]
+    problem = pose(hide(values, n=N_RUNS, duration_s=20.0), ("wheel_radius", "force_slip", "gyro_scale"))
+    (effect,) = varying_effects(problem, cause_fit(problem, problem.at(SIMULATION.vector), ()))
+    assert (effect.name, effect.rivals) == ("wheel_radius", ())
+    assert effect.scatter == pytest.approx(0.03 * np.sqrt(8 / 7), rel=0.15)
 
 
 @pytest.mark.parametrize(
