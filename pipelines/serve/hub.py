@@ -198,7 +198,11 @@ class Hub:
         return {
             "sessions": list(self.sessions),
             "served": self.served.content(),
-            "trouble": list(self.trouble.values()),
+            "trouble": [
+                sentence
+                for of, sentence in self.trouble.items()
+                if opened is None or of != f"watch of {opened.hello.session}"  # the robot shows it
+            ],
             "session": shown,
         }
 

@@ -27,9 +27,8 @@ from pipelines.report.tree import Column, Part, Report, Table, Text, sections
 from pipelines.serve.serve import Settings, loaded, stopping
 from terrain.control.robot_control import PilotSettings, check_table
 from terrain.control.slip_table import SlipTable, load_slip_table
-from terrain.discrepancy.compared import CHANNEL_WORDS
 from terrain.discrepancy.runs import in_order
-from terrain.discrepancy.watch import BLOCK_S, Alarm, Watch, read_watched
+from terrain.discrepancy.watch import BLOCK_S, WORDS, Alarm, Watch, read_watched
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live import CHANNELS
 from terrain.files.names import printable
@@ -365,8 +364,7 @@ def report(result: ReplayResult) -> Report:
 def _watched(result: ReplayResult) -> list[Part]:
     """Return the departures, and why blocks could not be compared."""
     rows = [
-        (each.run_id, each.text, each.raised_s, each.over_s, CHANNEL_WORDS[each.channel][0])
-        for each in result.alarms
+        (each.run_id, each.text, each.raised_s, each.over_s, WORDS[each.channel][0]) for each in result.alarms
     ]
     heads = (
         "run",
@@ -389,7 +387,7 @@ def _watch_figure(result: ReplayResult) -> Figure | None:
     for channel in result.blocks[0].levels:
         level = np.array([block.levels[channel] for block in result.blocks])
         limit = Line("alarm", driven_s, np.ones(len(level)), dashed=True)
-        panels.append(Panel([Line("sum", driven_s, level), limit], title=CHANNEL_WORDS[channel][0]))
+        panels.append(Panel([Line("sum", driven_s, level), limit], title=WORDS[channel][0]))
     caption = (
         "The largest of the channel's sums over the threshold of an alarm, which is held until the sum is 0."
     )

@@ -3,11 +3,11 @@
 Every :data:`BLOCK_S` the last samples are replayed by the extended model, measured and simulated behind one low-pass,
 as runs are by :mod:`terrain.discrepancy.runs`; a log is the same feed, looped.  A channel with residual ``r`` and
 prediction ``p`` has two figures a block: ``along = sum(r p) / |p|``, of a robot that turns or drives more or less than
-its model, and ``level = sum(r) / sqrt(n)``, of one that is off by an amount.  The file of the model states the variance
-of each in quiet runs, ``noise + scatter e``, where ``e = sum(p^2)``, of the level the sum of the squared wheel speed.
-``z`` is the figure over its standard deviation, and over ``sqrt(memory)``: its long-run variance (Newey and West 1987),
-as blocks that follow each other are alike, or rather the upper limit of it with 95 %.  It is cut off at :data:`CUT`, so
-that one rogue block is no alarm.
+its model, and ``level = sum(r) / sqrt(n)``, of one that is off by an amount.  The gyro minus the yaw rate from poses is
+one more channel.  The file of the model states the variance of each figure in quiet runs, ``noise + scatter e``, where
+``e = sum(p^2)``, of the level the sum of the squared wheel speed.  ``z`` is the figure over its standard deviation, and
+over ``sqrt(memory)``: its long-run variance (Newey and West 1987), as blocks that follow each other are alike, or
+rather the upper limit of it with 95 %.  It is cut off at :data:`CUT`, so that one rogue block is no alarm.
 
 Each figure has two cumulative sums (Page 1954), ``S = max(0, S +- z - offset - k)``, and is an alarm from ``S >= h``
 until ``S = 0``; ``offset`` bounds the mean that ``z`` has in quiet driving: that of a new session with 95 %, by
@@ -131,7 +131,12 @@ class Alarm(NamedTuple):
         return f"{departure(self.channel, self.kind, self.size)} since {clock_text(self.since_s)}{of_run}"
 
 
+BESIDE = "gyro_beside_poses_radps"  #: The gyro minus the yaw rate from poses: how a ground turns a robot is in both.
+NAMES = (*CHANNELS, BESIDE)
+WORDS = {**CHANNEL_WORDS, BESIDE: ("gyro minus yaw rate from poses", "rad/s")}
+
 ALONG = {
+    BESIDE: ("gyro reads", "more", "less"),
     GYRO: ("turns", "more", "less"),
     HEADING: ("turns", "more", "less"),
     SPEED_X: ("drives", "faster", "slower"),
@@ -152,12 +157,12 @@ def departure(channel: str, kind: str, size: float) -> str:
     """
     if kind == "along":
         verb, more, less = ALONG[channel]
-        by = f" by the {'gyro' if channel == GYRO else 'accelerometer'}" if channel in (GYRO, ACCEL) else ""
+        by = {GYRO: " by the gyro", ACCEL: " by the accelerometer", BESIDE: " beside poses"}.get(channel, "")
         if size < -1.0:
             return f"{verb} opposite to its model{by}"
         return f"{verb} {100 * abs(size):.2g} % {more if size > 0 else less} than its model{by}"
-    name, unit = CHANNEL_WORDS[channel]
-    turns = channel in (GYRO, HEADING, SPEED_Y)
+    name, unit = WORDS[channel]
+    turns = channel in (GYRO, HEADING, SPEED_Y, BESIDE)
     side = ("more to the left", "more to the right") if turns else ("more", "less")
     return f"{name} is {abs(size):.2g} {unit} {side[size < 0]} than its model"
 
@@ -238,13 +243,15 @@ def _compared(
     rows = rows_of(signals, simulation.planar_on(""), simulation.vector, (), low_pass)
     if rows.pace_mps.max(initial=0.0) < STANDSTILL_MPS:
         return Status.STANDS, "", {}
-    figures, residual = {}, rows.residual
-    for c, channel in enumerate(CHANNELS):
+    figures, gyro, heading = {}, CHANNELS.index(GYRO), CHANNELS.index(HEADING)
+    residual = np.column_stack([rows.residual, rows.residual[:, gyro] - rows.residual[:, heading]])
+    predicted = np.column_stack([rows.predicted, rows.predicted[:, gyro]])
+    for c, channel in enumerate(NAMES):
         known = np.isfinite(residual[:, c])
         n = int(known.sum())
         if n < LEAST_KNOWN * BLOCK_S * low_pass.rate_hz:
             continue
-        r, p, pace = residual[known, c], rows.predicted[known, c], rows.pace_mps[known]
+        r, p, pace = residual[known, c], predicted[known, c], rows.pace_mps[known]
         square = float(p @ p)
         if square > 0.0:
             figures[channel, "along"] = float(r @ p) / math.sqrt(square), square, square
@@ -293,7 +300,7 @@ def watched_on(runs: Sequence[RunLog], robot: Robot, source: str) -> Watched:
     for run in runs:
         found += [(run.session, block) for block in blocks_of(run, simulation, clock_hz)]
     deviations = {}
-    for of in [(channel, kind) for channel in CHANNELS for kind in KINDS]:
+    for of in [(channel, kind) for channel in NAMES for kind in KINDS]:
         own = [(session, *block.figures[of][:2]) for session, block in found if of in block.figures]
         if len(own) >= LEAST_BLOCKS and (each := _deviation(own, of[1])) is not None:
             deviations[of] = each
@@ -395,7 +402,7 @@ def read_watched(path: str | Path) -> Watched:
         raise ConfigError(f"{place}: deviations are {shown(entries)}, one by channel and kind is required")
     for name, entry in entries.items():
         channel, _, kind = str(name).partition(" ")
-        if channel not in CHANNELS or kind not in KINDS:
+        if channel not in NAMES or kind not in KINDS:
             raise ConfigError(f"{place}: {shown(name)} is no channel and kind ({' or '.join(KINDS)})")
         check_keys(f"{place}: {name}", entry, [*BlockDeviation._fields])
         if not all(is_number(value) and value >= 0.0 for value in entry.values()):
@@ -484,7 +491,7 @@ class Watch:
         """Return what a session says of it."""
         return {
             "alarms": [alarm._asdict() | {"text": alarm.text} for alarm in self.current],
-            "channels": {CHANNEL_WORDS[channel][0]: str(status) for channel, status in self.status.items()},
+            "channels": {WORDS[channel][0]: str(status) for channel, status in self.status.items()},
             "why": self.why or None,
         }
 
@@ -578,9 +585,9 @@ class Watch:
             if i is not None:
                 self.alarms[i] = self.alarms[self._open.pop(place)]._replace(over_s=end_s)
                 self.news.append(f"over at {clock_text(end_s)}: {self.alarms[i].text}")
-        elif i is not None:
+        elif i is not None and now.value >= threshold:  # not while it ends: that would be a mean of both
             self.alarms[i] = self.alarms[i]._replace(size=now.off / now.of)
-        elif now.value >= threshold:
+        elif i is None and now.value >= threshold:
             self._open[place] = len(self.alarms)
             alarm = Alarm(*place[:2], now.since_s, end_s, now.off / now.of, self.run_id, now.run_id)
             self.alarms.append(alarm)

@@ -5,7 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipelines.data.datasets import load_runs
+from terrain.discrepancy.runs import in_order
 from terrain.discrepancy.watch import (
+    BESIDE,
     BLOCK_S,
     OVERSHOOT,
     REFERENCE,
@@ -187,6 +190,33 @@ def test_nonsense_is_no_alarm_and_raises_nothing(watched, long_run, values):
     watch.step({"wheels": Reading(np.array([np.nan]), wheels), "imu": Reading(np.empty(0), np.empty((0, 9)))})
     watch.step({"wheels": Reading(np.array([1e12]), wheels), "unknown": Reading(np.zeros(1), wheels)})
     assert not watch.alarms
+
+
+# -- Measured runs ----------------------------------------------------------------------------------------------
+
+DRIVE_HUSKY = {
+    "effective_track_ratio": 1.4,
+    "clock_offset_s": -0.33,
+    "camera_latency_s": 0.23,
+    "lever_x_m": -0.25,
+}
+
+
+def test_measured_runs_agree_with_what_others_of_them_show_and_a_changed_gyro_departs(measured):
+    runs = in_order(load_runs(measured("drive_husky")))
+    robot = replace(HUSKY, effects=DRIVE_HUSKY, effects_cov=np.full((4, 4), np.nan))
+    held_out = runs[3::4]
+    watched = watched_on([run for run in runs if run not in held_out], robot, "three quarters of the runs")
+    assert not watch_runs(watched, held_out)[0].alarms
+    changed = []
+    for run in held_out:
+        imu = run.streams["imu"]
+        values = imu.values * np.where(np.array(imu.channels) == "gyro_z_radps", 1.2, 1.0)
+        changed.append(replace(run, streams={**run.streams, "imu": Stream(imu.time_s, values, imu.channels)}))
+    watch, first_s = watch_runs(watched, changed)
+    alarm = watch.alarms[0]
+    assert first_s < 120.0  # of 50 commands of 6 s
+    assert (alarm.channel, alarm.kind, alarm.size) == (BESIDE, "along", pytest.approx(0.2, rel=0.4))
 
 
 # -- The section of a description ------------------------------------------------------------------------------
