@@ -16,6 +16,10 @@ class OutsideRegionWarning(UserWarning):
     """A drive leaves the region that a robot's effects were validated in: it is extrapolated."""
 
 
+class NotTakenWarning(UserWarning):
+    """Filters do not take part of what was learned of a robot, which its simulation does."""
+
+
 class LogError(TerrainError):
     """A run log cannot be read as it stands: the message names file, row and value."""
 

@@ -7,7 +7,8 @@ and of turning, which filters do not model.  Whoever reads a run and its robot c
     run, robot = correct(run, robot)
 
 and filters take what is corrected.  A learned term (:mod:`terrain.learned_term`) of the motion is corrected alike, in
-the wheels' samples.  A live chain gives its estimator the robot and the
+the wheels' samples, of a car-like robot in the rows of its observers (:func:`rolling_axle`).  What of the terms filters
+do not take is warned of.  A live chain gives its estimator the robot and the
 :class:`Correction` of :func:`correct_live`.  Where a description lacks the section of a home, samples are
 corrected instead if the effect has an inverse.
 """
@@ -28,8 +29,11 @@ import yaml
 from terrain.angles import unwrapped
 from terrain.deviation import Deviation, deviation_lines
 from terrain.effects import (
+    ACCEL,
+    GYRO,
     PARAMETER,
     SCHEMA,
+    SPEED_Y,
     STAMPS,
     Block,
     changed_samples,
@@ -37,7 +41,7 @@ from terrain.effects import (
     checked_effects,
     parameters_of,
 )
-from terrain.errors import ConfigError, OutsideRegionWarning
+from terrain.errors import ConfigError, NotTakenWarning, OutsideRegionWarning
 from terrain.files.documents import parse_yaml, read_yaml
 from terrain.kinematics.wheels import no_slip_twist, rolled_twist, rolling_matrix
 from terrain.learned_term import INPUTS, MOTION, Factor, LearnedTerm, learned_lines, rolling_change
@@ -76,9 +80,8 @@ def apply_homes(robot: AnyRobot, names: Collection[str] = tuple(PARAMETER)) -> A
 def corrected(robot: AnyRobot) -> AnyRobot:
     """Return the robot that filters take, together with a log that is :func:`corrected_log`.
 
-    Of effects without a home in the description those are left that have no inverse on samples.  Learned motion of
-    robots that skid or drive on omni wheels is in the wheels' samples; of others filters know none.  A robot that was
-    corrected is returned as it is.
+    Of effects without a home in the description those are left that have no inverse on samples.  Learned motion is in
+    the samples of its wheels, or the rows of its observers.  A robot that was corrected is returned as it is.
 
     Examples
     --------
@@ -255,6 +258,8 @@ def correct(run: RunLog, robot: AnyRobot) -> tuple[RunLog, AnyRobot]:
     -----
     OutsideRegionWarning
         if the run leaves the region that the robot's effects were validated in.
+    NotTakenWarning
+        if it has learned terms that filters do not take.
 
     Examples
     --------
@@ -266,11 +271,41 @@ def correct(run: RunLog, robot: AnyRobot) -> tuple[RunLog, AnyRobot]:
     (array([1.1, 1.1]), {})
     """
     warn_outside(run, robot)
+    warn_not_taken(robot)
     return corrected_log(run, robot), corrected(robot)
+
+
+STANDING_MPS = 0.05  #: An axle that is slower has no turning radius.
+NOT_TAKEN = {SPEED_Y: "sideways speed", GYRO: "gyro", ACCEL: "accelerometer"}
+"""Channels that filters have, whose learned terms they do not take; the sideways speed but of robots that drive so."""
+
+
+def warn_not_taken(robot: Robot) -> None:
+    """Warn, in one sentence, of learned terms that filters of a robot do not take.
+
+    Warns
+    -----
+    NotTakenWarning
+        with the channels.
+    """
+    sideways = robot.sideways or robot.on_omni_wheels
+    left = {term.channel for term in robot.learned} - ({SPEED_Y} if sideways else set())
+    if words := [word for channel, word in NOT_TAKEN.items() if channel in left]:
+        warnings.warn(
+            f"filters of robot {robot.name} do not take what was learned of its {' and '.join(words)}, which "
+            "its simulation does",
+            NotTakenWarning,
+            stacklevel=3,
+        )
 
 
 def correct_live(robot: AnyRobot) -> tuple[AnyRobot, Correction | None]:
     """Return a robot as live filters take it, and what corrects the samples that come; None without effects.
+
+    Warns
+    -----
+    NotTakenWarning
+        if it has learned terms that filters do not take.
 
     Examples
     --------
@@ -278,6 +313,7 @@ def correct_live(robot: AnyRobot) -> tuple[AnyRobot, Correction | None]:
     >>> correct_live(load_robot("husky"))[1] is None
     True
     """
+    warn_not_taken(robot)
     return corrected(robot), Correction(robot) if robot.effects or robot.learned else None
 
 
@@ -291,18 +327,45 @@ def corrected_log(run: RunLog, robot: Robot) -> RunLog:
         return run
     wheels = run.streams.get("wheels")
     correction = Correction(robot, float(wheels.time_s[0]) if wheels is not None and len(wheels) else 0.0)
-    streams = {
-        name: Stream(*correction(name, stream.channels, stream.time_s, stream.values), stream.channels)
-        for name, stream in run.streams.items()
-    }
+    streams = dict(run.streams)
+    for name in sorted(streams, key="wheels".__eq__):  # which come last, as live
+        stream = streams[name]
+        streams[name] = Stream(
+            *correction(name, stream.channels, stream.time_s, stream.values), stream.channels
+        )
     return replace(run, streams=streams)
+
+
+def rolling_axle(
+    robot: BicycleRobot,
+    terms: Sequence[LearnedTerm],
+    speed_mps: float,
+    steer_rad: float,
+    step_s: float,
+    lags: Sequence[dict[Factor, Array]],
+) -> tuple[float, float]:
+    """Return the speed of the axle and the steering angle of a car-like robot that rolls as it moves by learned terms.
+
+    Parameters
+    ----------
+    speed_mps, steer_rad : as measured; NaN of a sample that is missing changes nothing
+    step_s : since the last sample
+    lags : memory of each term, moved on
+    """
+    inputs = np.zeros((1, len(INPUTS)))
+    inputs[:, :3] = rolled_twist(robot, np.array([[speed_mps]]), np.array([[steer_rad]]))
+    ahead, _, turn = (inputs[:, :3] + rolling_change(terms, inputs, np.array([step_s]), lags))[0].tolist()
+    if not math.isfinite(ahead + turn) or abs(ahead) < STANDING_MPS:
+        return speed_mps, steer_rad
+    steer_rad = math.atan(robot.wheelbase_m * turn / ahead)
+    return ahead / math.cos(steer_rad) if robot.front_driven else ahead, steer_rad
 
 
 class Correction:
     """Takes a robot's effects off samples, a run in one block or block by block.
 
-    Learned motion of a robot that skids or drives on omni wheels is added to the wheels: filters, which take these to
-    roll, then move as the body does.
+    Learned motion is added to the wheels, along the direction that each drives in: filters, which take these to roll,
+    then move as the body does.  Of a car-like robot it turns the steering too, and :attr:`axle_terms` are for its observers.
 
     Drifts count from the first stamp of the wheels, ``start_s``, by default from the first stamp that comes.
     """
@@ -319,8 +382,11 @@ class Correction:
         # what was added last comes off first: offsets, then factors
         self._acting = sorted(acting, key=lambda each: each[1].is_factor)
         self._memory: dict[str, Any] = {}
-        rolls = robot.skids or robot.on_omni_wheels
-        self._terms = [term for term in robot.learned if term.channel in MOTION] if rolls else []
+        terms = [term for term in robot.learned if term.channel in MOTION]
+        #: learned motion of a car-like robot; empty of others
+        self.axle_terms = terms if isinstance(robot, BicycleRobot) else []
+        self._terms = [] if self.axle_terms else terms
+        self._steered: tuple[Array, Array] = (np.empty(0), np.empty((0, len(robot.steer_channels))))
         self._lags: list[dict[Factor, Array]] = [{} for _ in self._terms]
 
     def __call__(
@@ -335,6 +401,8 @@ class Correction:
         own = [(value, inverse) for value, inverse in self._acting if name in inverse.streams]
         if any(inverse.columns != STAMPS for _, inverse in own):
             values = np.array(values, dtype=float)
+        if name == "steering" and self._terms:
+            self._remember(channels, time_s, values)
         added = self._rolling(name, channels, time_s, values)
         about = np.asarray(time_s), values, self._start_s, self._robot, self._applied, self._memory
         with np.errstate(invalid="ignore", over="ignore"):  # samples may be no finite numbers
@@ -350,7 +418,8 @@ class Correction:
         ratio = robot.motors.reduction_ratio if robot.by_motor else 1.0
         speed = values[:, places] * (robot.wheel_radius_m / ratio if robot.by_motor else 1.0)
         inputs = np.zeros((len(values), len(INPUTS)))
-        inputs[:, :3] = rolled_twist(robot, speed, np.zeros(speed.shape))
+        steer = self._steering(time_s, speed)
+        inputs[:, :3] = rolled_twist(robot, speed, steer)
         before = np.concatenate([[self._memory.get("learned", math.nan)], time_s])
         if np.isfinite(time_s).any():
             self._memory["learned"] = float(time_s[np.isfinite(time_s)][-1])
@@ -360,11 +429,34 @@ class Correction:
             turn = 0.5 * applied.track_m * change[:, 2]
             added[:, places] = np.column_stack([change[:, 0] - turn, change[:, 0] + turn])
         else:
-            place = robot.wheel_positions_m, robot.wheel_directions_rad, robot.roller_angles_rad
-            added[:, places] = change @ rolling_matrix(*place).T
+            place = robot.wheel_positions_m, steer + robot.wheel_directions_rad, robot.roller_angles_rad
+            along = np.einsum("nwk,nk->nw", rolling_matrix(*place), change)
+            added[:, places] = np.where(np.isfinite(along), along, 0.0)  # where no angle is known yet
         if robot.by_motor:
             added *= ratio / applied.wheel_radius_m
         return added
+
+    def _remember(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
+        """Keep the steering as measured until the wheels come."""
+        if not set(self._robot.steer_channels) <= set(channels):
+            return
+        angles = values[:, [channels.index(channel) for channel in self._robot.steer_channels]]
+        known = np.isfinite(time_s) & np.isfinite(angles).all(axis=1)
+        stamps = np.concatenate([self._steered[0], time_s[known]])
+        order = np.argsort(stamps, kind="stable")
+        self._steered = stamps[order], np.concatenate([self._steered[1], angles[known]])[order]
+
+    def _steering(self, time_s: Array, speed: Array) -> Array:
+        """Return the last angles (n, wheels) of the steering at stamps (n,); NaN before the first, 0 of others."""
+        if not self._robot.steered:
+            return np.zeros(speed.shape)
+        stamps, angles = self._steered
+        at = np.searchsorted(stamps, time_s, side="right") - 1
+        if len(at) and at[-1] > 0:
+            self._steered = stamps[at[-1] :], angles[at[-1] :]
+        if not len(stamps):
+            return np.full(speed.shape, np.nan)
+        return np.where(at[:, None] < 0, np.nan, angles[at] - self._robot.steering_zeros_rad)
 
 
 class Origin(StrEnum):

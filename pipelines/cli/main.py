@@ -14,7 +14,7 @@ import click
 
 from pipelines.cli.table import COMMANDS, FORMER
 from terrain import __version__
-from terrain.errors import OutsideRegionWarning, TerrainError
+from terrain.errors import NotTakenWarning, OutsideRegionWarning, TerrainError
 from terrain.files.names import printable
 
 MAX_MESSAGE = 1000  #: Characters of an error's message on the screen; of a longer one the middle is left out
@@ -84,10 +84,10 @@ def main() -> None:
     usual = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
-        if not issubclass(category, OutsideRegionWarning):
+        if not issubclass(category, OutsideRegionWarning | NotTakenWarning):
             usual(message, category, *place, **more)
             return
-        warnings.simplefilter("ignore", OutsideRegionWarning)  # of such drives the first alone is a note
+        warnings.simplefilter("ignore", category)  # of such drives the first alone is a note
         click.echo(f"note: {message}", err=True)
 
     warnings.showwarning = show

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ from terrain.discrepancy.gain import ratio_of_sums
 from terrain.discrepancy.health.fault import Fault
 from terrain.discrepancy.runs import LowPass, Signals, Simulation, rows_of
 from terrain.effects import CHANNELS
-from terrain.errors import DataError, TerrainError
+from terrain.errors import DataError, NotTakenWarning, TerrainError
 from terrain.estimation.estimate import Estimate, estimate_run, summarize
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
@@ -133,7 +134,9 @@ def filter_gain(runs: Sequence[RunLog], robot: Robot, extended: Simulation, seed
     better = replace(robot, effects=dict(extended.effects), effects_cov=np.empty((0, 0)))
     better = replace(better, learned=extended.learned)
     try:
-        rows = [[_errors(estimate_run(run, one, name)) for one in (robot, better)] for run in known]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotTakenWarning)  # the errors show it
+            rows = [[_errors(estimate_run(run, one, name)) for one in (robot, better)] for run in known]
     except TerrainError as error:
         return Comparison(name, str(error), len(known), {})
     errors = {}

@@ -558,7 +558,8 @@ class LiveObserver(Live):
         channels: Mapping[str, tuple[str, ...]],
         correction: Correction | None = None,
     ) -> None:
-        self.observer, self._feed = observer, ObserverFeed(robot, observer.rows, channels)
+        terms = () if correction is None else correction.axle_terms
+        self.observer, self._feed = observer, ObserverFeed(robot, observer.rows, channels, terms)
         self.name, self.states = observer.name, observer.states
         super().__init__(channels, self._feed.queues, 0.0, correction)
 

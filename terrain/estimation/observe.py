@@ -13,7 +13,7 @@ from terrain.estimation.estimate import known_mean, with_tracks
 from terrain.estimation.models.choice import make_observer
 from terrain.estimation.models.observer import Observer, ObserverStatus, ObserverTrack, observe, rows_of
 from terrain.estimation.models.slip_model import PARAMETERS, SlipModel
-from terrain.extension import correct
+from terrain.extension import Correction, correct
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
@@ -70,8 +70,9 @@ def observe_run(
         if the log has no wheels.
     """
     log, driven = correct(with_wheel_speeds(run, robot), robot)
+    terms = Correction(robot).axle_terms
     observer = make_observer(name, driven, slip_model)
-    time_s, rows, dropped = rows_of(log, driven, observer.rows)
+    time_s, rows, dropped = rows_of(log, driven, observer.rows, terms)
     missing = tuple(name for k, name in enumerate(observer.rows) if not np.isfinite(rows[:, k]).any())
     track = observe(observer, time_s, rows)
     return ObserverEstimate(run, driven, observer, track, dropped, missing)

@@ -1,22 +1,25 @@
 """Learned terms: read as written, off outside their region, and the same sample by sample and in a simulation."""
 
 from dataclasses import replace
+from functools import cache
+from itertools import islice, pairwise
 
 import numpy as np
 import pytest
 import yaml
 
-from terrain.effects import HEADING, SPEED_X
-from terrain.errors import ConfigError
+from terrain.effects import HEADING, SPEED_X, SPEED_Y
+from terrain.errors import ConfigError, NotTakenWarning
 from terrain.estimation.estimate import estimate_run
-from terrain.estimation.live import LiveFilter
-from terrain.extension import correct, correct_live, extended_yaml
+from terrain.estimation.live import make_live_filter
+from terrain.estimation.observe import observe_run
+from terrain.extension import correct, correct_live, extended_yaml, rolling_axle
 from terrain.learned_term import INPUTS, LearnedTerm, factors_of, learned_lines, read_learned
 from terrain.logs.replay import replay
 from terrain.records import Command, RunLog
 from terrain.robots import load_robot, robot_from
 from terrain.simulation.plants.planar import Ground
-from terrain.simulation.run import simulate
+from terrain.simulation.run import simulate, simulate_run
 from terrain.simulation.scenario import Patch, Scenario
 from terrain.terramechanics.soil import load_soil
 
@@ -105,18 +108,125 @@ def test_block_by_block_is_the_whole_run_and_a_missing_sample_stays_one():
     assert np.isfinite(whole[41]).all()
 
 
-def live_means(run, robot, correction):
-    channels = {name: run.streams[name].channels for name in ("wheels", "imu")}
-    live = LiveFilter(robot, "skid", channels, correction=correction)
-    return np.array([each.mean for sample in replay(run) for each in live.step(sample.readings)])
-
-
 def test_live_is_the_filter_of_the_corrected_log():
     run = driven(LEARNED)
     corrected_run, robot = correct(run, LEARNED)
-    live = live_means(run, *correct_live(LEARNED))
-    np.testing.assert_array_equal(live, live_means(corrected_run, robot, None))
+    live = live_track(run, "skid", *correct_live(LEARNED))
+    np.testing.assert_array_equal(live, live_track(corrected_run, "skid", robot, None))
     assert len(live) > 900
+
+
+# -- Robots that steer: their wheels, or the axle, roll as they move ------------------------------------------------
+
+STEERS = load_robot("agrimaro")
+SIDEWAYS = {**WIDE, "sideways_mps": (-1.0, 1.0)}
+MOVES = (
+    LOSS,
+    TURN,
+    term(SPEED_Y, ["sideways_mps", "speed_mps * turn_radps"], [0.2, 0.1], SIDEWAYS),
+)
+SLIDES = replace(STEERS, learned=MOVES)
+CAR = load_robot("adap2e")
+FAST = {"speed_mps": (-9.0, 9.0), "turn_radps": (-2.0, 2.0)}
+N_SAMPLES = 3000  #: That are replayed.
+DRIFTS = replace(
+    CAR,
+    learned=(
+        term(SPEED_X, ["speed_mps * abs(turn_radps)", "change(speed_mps, 0.3)"], [-0.2, 0.1], FAST),
+        term(HEADING, ["turn_radps"], [-0.3], {"turn_radps": (-2.0, 2.0)}),
+    ),
+)
+
+
+@cache
+def steered():
+    left = 0.15 * np.sin(0.7 * TIME_S)
+    return simulate(SLIDES, np.column_stack([TWIST[:, 0], left, TWIST[:, 2]]), Ground(slip_ratio=0.0), 0)
+
+
+@cache
+def car_run():
+    return simulate_run(DRIFTS, "grass", "survey", 3, duration_s=20.0)
+
+
+def error_of(track, run, names):
+    true = run.streams["truth"]
+    apart = [track.state(name) - np.interp(track.time_s, true.time_s, true.channel(name)) for name in names]
+    return np.sqrt(np.mean(np.square(apart)[:, 100:]))
+
+
+@pytest.mark.parametrize(("name", "factor"), [("encoder12", 10.0), ("vio12", 2.0), ("vio15", 2.0)])
+def test_filters_of_a_robot_that_steers_are_nearer_to_how_it_moves(name, factor):
+    found, plain = (estimate_run(steered(), robot, name) for robot in (SLIDES, STEERS))
+    speeds = "speed_x_mps", "speed_y_mps"
+    assert factor * error_of(found.track, steered(), speeds) < error_of(plain.track, steered(), speeds)
+    slips = [np.sqrt(np.nanmean(each.blind.slip_ratio[100:] ** 2)) for each in (found, plain)]
+    assert 2.0 * slips[0] < slips[1]
+
+
+@pytest.mark.parametrize("name", ["sideslip-kinematic", "sideslip-dynamic", "sideslip-multi"])
+def test_observers_of_a_car_take_its_axle_and_steering_to_roll_so(name):
+    found, plain = (observe_run(car_run(), robot, name).track for robot in (DRIFTS, CAR))
+    slips = [np.sqrt(np.nanmean(each.slip[100:] ** 2)) for each in (found, plain)]
+    assert 1.8 * slips[0] < slips[1]
+
+
+def test_an_axle_that_rolls_so_moves_by_the_law_and_stands_as_it_is_measured():
+    about = DRIFTS, DRIFTS.learned[1:], 2.0, 0.2, 0.02
+    speed, angle = rolling_axle(*about, [{}])
+    assert speed == 2.0
+    assert np.tan(angle) == pytest.approx(0.7 * np.tan(0.2))
+    assert rolling_axle(*about[:2], 0.01, 0.2, 0.02, [{}]) == (0.01, 0.2)
+    assert np.isnan(rolling_axle(*about[:2], np.nan, 0.2, 0.02, [{}])[0])
+
+
+def test_wheels_that_are_steered_are_corrected_alike_block_by_block():
+    run = steered()
+    log, _ = correct(run, SLIDES)
+    _, correction = correct_live(SLIDES)
+    edges, rows = [-np.inf, 0.5, 0.51, 0.9, 7.0, np.inf], []
+    for start_s, end_s in pairwise(edges):
+        for name in ("steering", "wheels"):
+            stream = run.streams[name]
+            own = (stream.time_s > start_s) & (stream.time_s <= end_s)
+            got = correction(name, stream.channels, stream.time_s[own], stream.values[own].copy())[1]
+            rows += [got] if name == "wheels" else []
+    np.testing.assert_array_equal(np.vstack(rows), log.streams["wheels"].values)
+
+
+def live_track(run, name, robot, correction):
+    channels = {each: stream.channels for each, stream in run.streams.items()}
+    live = make_live_filter(name, robot, channels, {}, correction)
+    samples = islice(replay(run), N_SAMPLES)
+    return np.array([each.mean for sample in samples for each in live.step(sample.readings)])
+
+
+def test_live_is_the_log_of_robots_that_steer():
+    log, robot = correct(steered(), SLIDES)
+    live = live_track(steered(), "vio15", *correct_live(SLIDES))
+    np.testing.assert_array_equal(live, live_track(log, "vio15", robot, None))
+    live = live_track(car_run(), "sideslip-multi", *correct_live(DRIFTS))
+    whole = observe_run(car_run(), DRIFTS, "sideslip-multi").track.mean
+    np.testing.assert_array_equal(live, whole[: len(live)])
+    assert len(live) > 200
+
+
+@pytest.mark.parametrize(
+    ("robot", "channel", "words"),
+    [
+        (HUSKY, SPEED_Y, "sideways speed"),
+        (CAR, SPEED_Y, "sideways speed"),
+        (STEERS, "yaw_rate_radps", "gyro"),
+        (HUSKY, "accel_x_mps2", "accelerometer"),
+    ],
+)
+def test_what_filters_do_not_take_is_said_in_one_sentence(robot, channel, words):
+    given = replace(robot, learned=(term(channel, ["speed_mps"], [0.1], {"speed_mps": (-2.0, 2.0)}),))
+    sentence = f"filters of robot {robot.name} do not take what was learned of its {words}, which its simulation does"
+    with pytest.warns(NotTakenWarning, match=f"^{sentence}$"):
+        correct_live(given)
+    with pytest.warns(NotTakenWarning, match=f"^{sentence}$"):
+        correct(driven(HUSKY), given)
 
 
 # -- The section of a description ----------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,8 +28,10 @@ from terrain.errors import DataError
 from terrain.estimation.clocks import CLOCK_SET_S, Due, SampleQueue, check_channels
 from terrain.estimation.feed import TICK_S, places_among
 from terrain.estimation.filter import Filter, FilterModel, FilterSettings
+from terrain.extension import rolling_axle
+from terrain.learned_term import Factor, LearnedTerm
 from terrain.records import GATED, REOPENED, USED, Array, RunLog
-from terrain.robots import Robot
+from terrain.robots import BicycleRobot, Robot
 from terrain.status import StatusCode
 
 LONGEST_STEP_S = 1.0
@@ -207,6 +209,7 @@ class ObserverFeed(_WithMemory):
     robot : tracked or car-like
     rows : those of :data:`ROWS` that the observer takes
     channels : names of the columns of each stream; ``ConfigError`` if the wheels have no speed that the observer takes
+    terms : learned motion of a car-like robot (:attr:`terrain.extension.Correction.axle_terms`)
 
     Attributes
     ----------
@@ -216,8 +219,14 @@ class ObserverFeed(_WithMemory):
         inaccurate fixes, and clocks that were set back
     """
 
-    def __init__(self, robot: Robot, rows: tuple[str, ...], channels: Mapping[str, tuple[str, ...]]) -> None:
-        wheels = channels.get("wheels", ())
+    def __init__(
+        self,
+        robot: Robot,
+        rows: tuple[str, ...],
+        channels: Mapping[str, tuple[str, ...]],
+        terms: Sequence[LearnedTerm] = (),
+    ) -> None:
+        self._robot, self._terms, wheels = robot, tuple(terms), channels.get("wheels", ())
         check_channels("wheels", robot.rate_channels, wheels)
         self._speeds, self._rows = {name: wheels.index(name) for name in robot.rate_channels}, rows
         self.queues = {
@@ -231,6 +240,7 @@ class ObserverFeed(_WithMemory):
     def begin(self) -> None:
         """Begin anew: nothing was measured before."""
         self.last_s = -math.inf
+        self._lags: list[dict[Factor, Array]] = [{} for _ in self._terms]
         for queue in self.queues.values():
             queue.taken_s = -math.inf
         self._held: dict[tuple[str, int], tuple[float, float]] = {}
@@ -249,7 +259,7 @@ class ObserverFeed(_WithMemory):
 
     def tick(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> Array:
         """Return the row (m,) at a sample of the wheels, of the samples of other streams that came since the last."""
-        self.last_s = time_s
+        step_s, self.last_s = time_s - self.last_s, time_s
         for name, samples in due.items():
             if not samples and self.queues[name].n_behind >= CLOCK_SET_SAMPLES:  # its own clock was set back
                 self.dropped["time: clock set"] += 1
@@ -258,6 +268,13 @@ class ObserverFeed(_WithMemory):
         speeds = {name: float(wheels[column]) for name, column in self._speeds.items()}
         row |= speeds | dict(zip(ROWS[7:], self._means("imu", time_s, due), strict=True))
         (row["steer_front_rad"],) = self._means("steering", time_s, due, last=True)
+        if self._terms and isinstance(self._robot, BicycleRobot):
+            # what is remembered before a tick may be gone back to
+            self._lags = [{factor: lag.copy() for factor, lag in own.items()} for own in self._lags]
+            (name, speed), angle = *speeds.items(), row["steer_front_rad"]
+            row[name], row["steer_front_rad"] = rolling_axle(
+                self._robot, self._terms, speed, angle, step_s, self._lags
+            )
         row |= zip(ROWS[4:7], self._fix(time_s, sum(speeds.values()) / len(speeds), due), strict=True)
         return np.array([row[name] for name in self._rows])
 
@@ -308,7 +325,9 @@ class ObserverFeed(_WithMemory):
         return x, y, yaw
 
 
-def rows_of(run: RunLog, robot: Robot, rows: tuple[str, ...]) -> tuple[Array, Array, dict[str, int]]:
+def rows_of(
+    run: RunLog, robot: Robot, rows: tuple[str, ...], terms: Sequence[LearnedTerm] = ()
+) -> tuple[Array, Array, dict[str, int]]:
     """Return times (n,) and rows (n, m) of all ticks of a run, as they would come live, and what was dropped.
 
     Raises
@@ -320,7 +339,7 @@ def rows_of(run: RunLog, robot: Robot, rows: tuple[str, ...]) -> tuple[Array, Ar
     """
     if "wheels" not in run.streams or len(run.streams["wheels"]) == 0:
         raise DataError(f"{run.run_id}: it has no stream wheels")
-    feed = ObserverFeed(robot, rows, {name: stream.channels for name, stream in run.streams.items()})
+    feed = ObserverFeed(robot, rows, {name: stream.channels for name, stream in run.streams.items()}, terms)
     wheels, times, found = run.streams["wheels"], [], []
     edges = {
         name: [0, *np.searchsorted(run.streams[name].time_s, wheels.time_s + TICK_S, side="right").tolist()]
