@@ -341,7 +341,8 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
         label = effect_label(cause.name)
         beside = cause.held_out_gain, cause.z, result.terms.get(cause.name, "")
         for value in cause.parameters:
-            causes.append((label, quantity(value.name, value.value), quantity_interval(value), *beside))
+            of = f"{label} ({PARAMETER[value.name].label})" if len(cause.parameters) > 1 else label
+            causes.append((of, quantity(value.name, value.value), quantity_interval(value), *beside))
         if cause.aliases:
             notes.append(
                 f"No log distinguishes {label} from {enumerated([*map(effect_label, cause.aliases)])}."
