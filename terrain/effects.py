@@ -211,7 +211,7 @@ class Effect(NamedTuple):
     channels: tuple[str, ...]  #: where it is visible: a tenth as clearly over the noise as in the clearest
     needs: str  #: the driving that excites it
     source: str  #: of its formula
-    #: changes of pose show it without forces: :mod:`terrain.calibration.poses` fits it
+    #: changes of pose show it: :mod:`terrain.calibration.poses` fits it
     kinematic: bool = False
     sensed_only: bool = False  #: it changes what sensors measure, and not the motion of the body
     stage: Stage | None = None  #: where it acts in the dynamic simulation, of the robots that that simulates

@@ -11,6 +11,7 @@ import numpy as np
 from pipelines.explain.explain import explain
 from terrain.calibration.finding import Finding
 from terrain.calibration.poses import PoseFit, findings_by, fit_poses, leg_errors
+from terrain.effects import PARAMETER
 from terrain.errors import TerrainError
 from terrain.extension import extended_yaml
 from terrain.files.atomic import atomic_write, ensure_writable
@@ -70,8 +71,15 @@ def table(first: Sequence[Finding], second: Sequence[Finding], whole: Sequence[F
 
 
 def extended(fitted: PoseFit, robot: Robot, out: Path) -> Path:
-    """Write the robot with what its poses show built in, and return the file."""
-    shown = [i for i, name in enumerate(fitted.names) if fitted.fit.identified[i]]
+    """Write the robot with what its poses show built in, and return the file.
+
+    Poses that are early, as of clocks that differ, are no property of the robot, and slip is the ground's.
+    """
+    within = [
+        PARAMETER[name].low <= value <= PARAMETER[name].high and name != "force_slip_ratio"
+        for name, value in fitted.values.items()
+    ]
+    shown = [i for i, seen in enumerate(fitted.fit.identified) if seen and within[i]]
     names = [fitted.names[i] for i in shown]
     values = {name: float(fitted.fit.value[i]) for name, i in zip(names, shown, strict=True)}
     ends = {name: tuple(fitted.fit.interval[:, i].tolist()) for name, i in zip(names, shown, strict=True)}

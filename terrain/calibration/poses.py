@@ -17,8 +17,10 @@ their errors alike: clusters are blocks of time, and the covariance is that of l
 
 **What is not separated.**  Where a wheel that is not steered drives, the gain of the steering and the wheelbase act as
 one while the angles stay small: the effective wheelbase L over the gain is stated.  A wheel that drives and is steered
-shows both.  A number is stated only where its interval is below half of the plausible range.  Radius, ticks
-a turn and gear are one number too, that of the described ticks and gear.
+shows both.  A car that speeds up slips by its traction, which over a second looks like
+earlier poses: the slip is fitted beside the delay, whose interval holds that.  A number is stated only where its
+interval is below half of the plausible range.  Radius, ticks a turn and gear are one number too, that of the described
+ticks and gear.
 """
 
 from __future__ import annotations
@@ -50,6 +52,8 @@ BLOCKS = 12  #: Clusters of a fit at the least, where a block is then longer tha
 LONGEST_BLOCK_S = 20.0  #: Of a cluster: slower than that, grounds and temperatures change.
 MIN_LEGS = 48
 DELAY_S = (-0.5, 1.0)  #: Bounds of the delay of poses behind the wheels, of either sign: clocks differ.
+#: Bounds that are not those of the library; a firm ground has no slip that others could have less of.
+BOUNDS = {"camera_latency_s": DELAY_S, "force_slip_ratio": (0.0, PARAMETER["force_slip_ratio"].high)}
 FIRST_ERROR = (0.02, 0.02, 0.02)  #: Sizes of residuals that a fit begins with, in m and rad.
 LEAST_ERROR = (1e-4, 1e-4, 1e-4)
 PASSES = 3  #: Of a fit that finds the sizes of its residuals.
@@ -66,7 +70,7 @@ def kinematic_of(robot: Robot) -> tuple[str, ...]:
     --------
     >>> from terrain.robots import load_robot
     >>> kinematic_of(load_robot("omnirobot"))[-2:], kinematic_of(load_robot("husky"))
-    (('lever_y_m', 'wheel_distance_ratio'), ())
+    (('force_slip_ratio', 'wheel_distance_ratio'), ())
     """
     if not (robot.on_omni_wheels or isinstance(robot, BicycleRobot)):
         return ()
@@ -259,7 +263,7 @@ def fit_poses(
     parameters = []
     for name in chosen:
         known = PARAMETER[name]
-        low, high = DELAY_S if name == "camera_latency_s" else (known.low, known.high)
+        low, high = BOUNDS.get(name, (known.low, known.high))
         parameters.append(Parameter(name, 0.0, low, high, step=4.0 * known.step))
     error = np.array(FIRST_ERROR)
 

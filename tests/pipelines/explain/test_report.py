@@ -92,7 +92,7 @@ def test_the_first_screen_answers_what_why_how_certain_what_for_and_what_next(ex
         "What it gains On 2 runs held out: over all channels named causes remove 50 % (40 to 60 %); a black-box "
         "learner removes 76 %",
         "What next Simulate and estimate with extended.yaml in place of the robot's file",
-        "lever arm 0.1 m 90 mm to 0.11 m 40.0 % 9.0",
+        "lever arm (lever x) 0.1 m 90 mm to 0.11 m 40.0 % 9.0",
         "No log distinguishes lever arm from an alias.",
     ):
         assert stated in text

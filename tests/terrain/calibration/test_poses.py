@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import cumulative_trapezoid
 
 from pipelines.data.datasets import load_runs
-from terrain.calibration.poses import PoseFit, fit_poses, pose_findings
+from terrain.calibration.poses import PoseFit, fit_poses, kinematic_of, pose_findings
 from terrain.errors import DataError
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
@@ -114,6 +114,27 @@ def test_what_a_drive_does_not_show_has_no_value():
         assert not found[f"identified.{name}"].determined
 
 
+@pytest.mark.parametrize("slip_ratio", [0.0, 0.03])
+def test_slip_of_a_fast_car_that_speeds_up_is_no_delay(slip_ratio):
+    """At 20 m/s a slip of 3 % at the traction of its weight looks like poses that are 60 ms early."""
+    robot, rng, n = load_robot("av21"), np.random.default_rng(3), 6000
+    speed = 20.0 + waves(rng, n, 5.0)
+    driven = speed / (1.0 - slip_ratio * np.gradient(speed, DT) / 9.81)
+    pose = poses_by(np.column_stack([speed, 0 * speed, 0 * speed]), (0, 0), 0.0, (0.01, 0.01, 1e-3), 3)
+    time_s, wheels = DT * np.arange(n), np.column_stack([driven] * len(robot.rate_channels))
+    streams = {
+        "wheels": Stream(time_s, wheels, robot.rate_channels),
+        "steering": Stream(time_s, np.zeros((n, len(robot.steer_channels))), tuple(robot.steer_channels)),
+        "pose": Stream(time_s, pose, ("position_x_m", "position_y_m", "yaw_rad")),
+    }
+    ahead = ("wheel_radius_ratio", "camera_latency_s", "force_slip_ratio")
+    names = [name for name in kinematic_of(robot) if name in ahead]
+    fitted = fit_poses([RunLog("car", robot.name, streams)], robot, names)
+    place = names.index("camera_latency_s")
+    assert abs(fitted.fit.value[place]) < max(2.5 * fitted.fit.std[place], 0.002)
+    assert fitted.fit.std[place] < 0.01
+
+
 @pytest.mark.parametrize("missing", ["wheels", "steering", "pose"])
 def test_a_run_without_a_stream_is_one_sentence(missing):
     run, robot = tricycle_run(0, 400), load_robot("pallet_truck")
@@ -150,7 +171,7 @@ def agree(runs, robot, least):
         if one.determined and other.determined:
             compared += 1
             half = np.hypot(one.high - one.low, other.high - other.low) / 2
-            assert abs(one.value - other.value) <= 1.5 * half, (name, one, other)  # of a dozen, one in 20
+            assert abs(one.value - other.value) <= 1.2 * half, (name, one, other)  # of a dozen, one in 20
     assert compared >= least
 
 
