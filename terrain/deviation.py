@@ -7,8 +7,8 @@ Of a channel, measured minus simulated behind one low-pass has the standard devi
 with the speed ``v`` of the wheels and the difference ``w`` of those of the two sides, m/s both (``speed_mps`` or, of
 omni wheels, with ``sideways_mps``, and ``turn_mps`` of :data:`terrain.discrepancy.runs.INPUTS`): a robot that stands is
 quiet.  Within ``times_95 s`` lie 95 % of the rows of a further run.  That factor is a quantile of ``|r| / s`` of runs
-that were left out of the fit, as tails are heavy and runs differ: split conformal prediction over runs (Dunn,
-Wasserman and Ramdas, Distribution-free prediction sets for two-layer hierarchical models, JASA 2023).
+that were left out of the fit in turn, as tails are heavy (jackknife: Barber, Candes, Ramdas and Tibshirani, Annals of
+Statistics 2021), and larger where few runs differ from one to the next.
 
 The section ``deviation`` of a robot's description::
 

@@ -365,7 +365,7 @@ class Correction:
     """Takes a robot's effects off samples, a run in one block or block by block.
 
     Learned motion is added to the wheels, along the direction that each drives in: filters, which take these to roll,
-    then move as the body does.  Of a car-like robot it turns the steering too, and :attr:`axle_terms` are for its observers.
+    then move as the body does.  Of a car-like robot it turns the steering too by :attr:`axle_terms` of its observers.
 
     Drifts count from the first stamp of the wheels, ``start_s``, by default from the first stamp that comes.
     """

@@ -30,7 +30,6 @@ LEAST = (
     0.02  #: Part of the mean square that a row weighs as in the fit, so that those at rest are not all of it.
 )
 TINY = 1e-30  #: A square of nothing, by which is divided.
-MAX_FOLDS = 12  #: Parts of the runs that are left out in turn.
 N_FITS = 5  #: Of the fit by weights that follow from the one before.
 
 
@@ -103,29 +102,24 @@ def deviation_of(
         if n < MIN_UNITS or not r[known].any():
             continue
         rest, per_speed, per_turn = np.sqrt(_growth(powers[known], r[known] ** 2)).tolist()
-        times_95 = _factor(powers[known], r[known], of[known])
-        channels[name] = ChannelDeviation(rest, per_speed, per_turn, times_95, n)
+        own = ChannelDeviation(rest, per_speed, per_turn, 1.0, n)
+        times_95 = _factor(r[known] / own.std(speed[known], turn[known]), of[known])
+        channels[name] = own._replace(times_95=times_95)
     return Deviation(low_pass.cutoff_hz, low_pass.rate_hz, channels)
 
 
-def _factor(powers: Array, r: Array, units: Array) -> float:
-    """Return half of the 95 % interval of residuals (m,) over their standard deviation, of units (m,) left out of it.
+def _factor(ratio: Array, units: Array) -> float:
+    """Return half of the 95 % interval over the standard deviation, of residuals over that (m,) and their units (m,).
 
-    It is the quantile over all rows (cross-conformal: Vovk, Annals of Mathematics and Artificial Intelligence 2015),
-    times that of Student's t over a normal one.  Its degrees of freedom are those of the mean squares of units, as
-    they scatter (Satterthwaite, Biometrics Bulletin 1946): many where each unit shows the noise, as many as units where
-    each has an offset of its own.
+    It is the quantile over all rows, times that of Student's t over a normal one.  Its degrees of freedom are those of
+    the mean squares of units, as they scatter (Satterthwaite, Biometrics Bulletin 1946): many where each unit shows the
+    noise, as many as units where each has an offset of its own.
     """
     names, of = np.unique(units, return_inverse=True)
-    ratio = np.empty_like(r)
-    for k in range(min(len(names), MAX_FOLDS)):
-        inside = of % MAX_FOLDS == k
-        size = _growth(powers[~inside], r[~inside] ** 2)
-        ratio[inside] = np.abs(r[inside]) / np.sqrt(powers[inside] @ size)
     n, square = len(names), float(np.mean(ratio**2))
-    apart = np.bincount(of, weights=ratio**2 - square) / len(r)
+    apart = np.bincount(of, weights=ratio**2 - square) / len(ratio)
     freedom = max(2.0 * square**2 * (n - 1) / n / max(float(apart @ apart), TINY), 1.0)
-    return float(np.quantile(ratio, COVERED) * student.ppf(TAIL, freedom) / ndtri(TAIL))
+    return float(np.quantile(np.abs(ratio), COVERED) * student.ppf(TAIL, freedom) / ndtri(TAIL))
 
 
 def _growth(powers: Array, square: Array) -> Array:
