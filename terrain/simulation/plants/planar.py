@@ -713,6 +713,7 @@ def _move_omni(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array
     wheel_speed_mps, _steer_rad, grade_rad, roll_rad, disturbance = inputs
     rollers, p, n = params[0], vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
     body, out = rollers.body, np.zeros(n, TRUTH)
+    turned = turned_wheels(wheel_speed_mps, p, body.radius_m, dt)
     along, across, load = _placed(rollers, p)
     com_x, com_y = body.com_x_m + p.load_shift_x_m, body.com_y_m + p.load_shift_y_m
     friction = rollers.roller_ratio + p.roller_friction_ratio
@@ -724,8 +725,8 @@ def _move_omni(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array
     step, size = dt / SUBSTEPS, 0.0
     for k in range(n):
         slope = (-mass * gravity * math.sin(grade_rad[k]), -mass * gravity * math.sin(roll_rad[k]), 0.0)
-        u = wheel_speed_mps[k] * (1.0 + p.wheel_radius_ratio)
-        last = wheel_speed_mps[max(k - 1, 0)] * (1.0 + p.wheel_radius_ratio)
+        u = turned[k] * (1.0 + p.wheel_radius_ratio)
+        last = turned[max(k - 1, 0)] * (1.0 + p.wheel_radius_ratio)
         started_x, started_y = before[0], before[1]
         for part in range(SUBSTEPS):
             wheels = last + (u - last) * ((part + 1) / SUBSTEPS)
@@ -773,7 +774,7 @@ def _move_omni(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array
             0.0,
         )  # what the wheels roll, along which the body slips; 0 where neither moves, and in place
         for i in range(body.n_wheels):
-            u_i = wheel_speed_mps[k, i] * (1.0 + p.wheel_radius_ratio)
+            u_i = turned[k, i] * (1.0 + p.wheel_radius_ratio)
             x += rollers.to_rolled[0, i] * u_i
             y += rollers.to_rolled[1, i] * u_i
         rolled = math.sqrt(x * x + y * y)
@@ -795,6 +796,7 @@ def currents_of(params: Array, vector: Array, dt: float, wheel_speed_mps: Array,
     """
     rollers, p, (n, wheels) = params[0], vector.view(EFFECTS)[0], wheel_speed_mps.shape
     body, out = rollers.body, np.empty((n, wheels))
+    turned = turned_wheels(wheel_speed_mps, p, body.radius_m, dt)
     weight = body.mass_kg * (1.0 + p.payload_ratio) * GRAVITY_MPS2
     radius_m, twist = body.radius_m * (1.0 + p.wheel_radius_ratio), np.empty(3)
     along, across, load = _placed(rollers, p)
@@ -802,9 +804,9 @@ def currents_of(params: Array, vector: Array, dt: float, wheel_speed_mps: Array,
     com_x, com_y = body.com_x_m + p.load_shift_x_m, body.com_y_m + p.load_shift_y_m
     spun = np.empty((n, wheels))
     for i in range(wheels):
-        spun[:, i] = slopes(wheel_speed_mps[:, i].copy(), dt)
+        spun[:, i] = slopes(turned[:, i].copy(), dt)
     for k in range(n):
-        u, w = wheel_speed_mps[k] * (1.0 + p.wheel_radius_ratio), truth[k].yaw_rate_radps
+        u, w = turned[k] * (1.0 + p.wheel_radius_ratio), truth[k].yaw_rate_radps
         twist[0], twist[1] = truth[k].speed_x_mps - w * com_y, truth[k].speed_y_mps + w * com_x
         twist[2] = w
         speed, slip = _fastest(along, u, twist), 0.0

@@ -58,13 +58,13 @@ LEFT_OUT = {
             "clock_offset",
             "clock_rate",
         ),
-        *("encoder_lag", "motor_constant", "motor_drift", "current_offset"),
+        *("wheel_dead_zone", "encoder_lag", "motor_constant", "motor_drift", "current_offset"),
     ),
     "bicycle": ("payload", "rolling_resistance", "viscous_drag", "slip_resistance", "current_offset"),
 }
 LEFT_OUT |= {"mecanum": LEFT_OUT["omni"], "tricycle": LEFT_OUT["bicycle"]}
 """Effects that act and are not looked for: on omni robots those of an IMU, which these logs do not have, and
-of lags and currents that the friction of the rollers hides; on cars, whose currents are not logged, a load,
+of lags, currents and a dead zone that the friction of the rollers hides; on cars, whose currents are not logged, a load,
 which looks like softer tyres, and resistances, which look like a smaller radius."""
 
 #: Response over noise, over that of the clearest channel, from which on one may be named and has to be.

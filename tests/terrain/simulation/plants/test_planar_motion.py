@@ -400,6 +400,7 @@ def test_a_wheel_follows_its_motor_through_play_and_a_dead_zone():
         ("adap2e", {"steering_lag_s": 0.2, "steering_gain_ratio": 0.1, "steering_offset_front_rad": 0.02}),
         ("adap2e", {"steering_lag_s": 0.2, "steering_backlash_rad": 0.03}),
         ("agrimaro", {"steering_gain_ratio": 0.05, "steering_lag_s": 0.15}),
+        ("robotino", {"drive_backlash_rad": 0.1}),
     ],
 )
 def test_what_comes_off_a_log_is_what_the_replay_puts_on(name, values):
