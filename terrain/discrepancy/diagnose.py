@@ -69,8 +69,8 @@ ENTANGLED = 0.97
 """Correlation of fitted values above which two causes are ambiguous: a collinearity index of 6."""
 
 LITTLE_LEFT = 0.05
-"""Part of the square of a channel that the black-box learner has to remove, at the lower end of its interval, before
-something is unexplained: less would not change what the simulation is good for."""
+"""Part of the square of a channel that depends on an input, or that the black-box learner removes at the lower end of
+its interval, before something is unexplained: less would not change what the simulation is good for."""
 
 POWER_Z = 1.28  #: Added to the threshold, so that nine in ten are detected
 
@@ -270,6 +270,8 @@ def statement_of(found: Found, judgement: Judgement) -> verdict.Diagnosis:
     for (channel, name), probe in _probes(problem, fit).items():
         if probe.significant and (channel not in best or probe.z > best[channel].z):
             ratio = min(probe.gain / float(power[CHANNELS.index(channel)]), 1.0)
+            if ratio < LITTLE_LEFT:
+                continue
             best[channel] = verdict.Unexplained(channel, name, probe.z, ratio)
     for out in withdrawn.values():
         # where it shows most while the causes are fitted with it: a wheel radius beside an effective track shows in
@@ -277,9 +279,13 @@ def statement_of(found: Found, judgement: Judgement) -> verdict.Diagnosis:
         own, base = _own_and_base(fit, effect_named(out.name))
         weights = np.eye(len(fit.info.names))[own]
         weights[:, base] = -partial_information(fit.info.a.sum(axis=0), base, own)[0].T
-        channel = CHANNELS[int(np.argmax(fit.info.channel_power(weights)))]
-        if channel not in best and out.name not in varies and fit.tests[out.name].z > Z_EFFECT:
-            best[channel] = verdict.Unexplained(channel, out.name, out.z, 0.0)
+        c = int(np.argmax(fit.info.channel_power(weights)))
+        changed = fit.info.channel_power(fit.tests[out.name].change[None] @ weights)
+        channel, ratio = CHANNELS[c], min(float(changed[c] / power[c]), 1.0)
+        if channel in best or out.name in varies or ratio < LITTLE_LEFT:
+            continue
+        if fit.tests[out.name].z > Z_EFFECT:
+            best[channel] = verdict.Unexplained(channel, out.name, out.z, ratio)
     unexplained = tuple(sorted(best.values(), key=lambda left: -left.z))
 
     named, sets = found.answers

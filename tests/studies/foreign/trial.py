@@ -25,6 +25,7 @@ from terrain.discrepancy.evidence import Z_EFFECT, Evidence, evidence_at, margin
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.runs import Simulation, low_pass_of, signals_of
 from terrain.discrepancy.search import names_of
+from terrain.discrepancy.verdict import Tier
 from terrain.effects import PARAMETER, library_of, parameters_of
 from terrain.errors import DataError
 from terrain.kinematics.logged_wheels import with_wheel_speeds
@@ -185,7 +186,13 @@ def asked(runs: Sequence[RunLog], robot: Robot) -> tuple[Answer, Robot]:
         varying=tuple(each.name for each in diagnosis.varying),
         faults=tuple(fault.sentence for fault in diagnosis.faults),
         candidates=tuple(cause.name for cause in diagnosis.candidates),
-        unexplained=tuple(dict.fromkeys(left.channel for left in diagnosis.unexplained)),
+        unexplained=tuple(
+            dict.fromkeys(
+                each.channel
+                for each in (*diagnosis.unexplained, *diagnosis.channels)
+                if getattr(each, "tier", Tier.UNEXPLAINED) is Tier.UNEXPLAINED
+            )
+        ),
         learned=tuple(term.channel for term in terms),
     ), found.extended
 
