@@ -161,7 +161,7 @@ def is_clipped(values: Mapping[str, float]) -> bool:
 
     Examples
     --------
-    >>> is_clipped({"gyro_scale_ratio": 0.9 * 0.05}), is_clipped({"gyro_scale_ratio": 0.04})
+    >>> is_clipped({"gyro_scale_ratio": 0.9 * 0.08}), is_clipped({"gyro_scale_ratio": 0.04})
     (True, False)
     """
     return any(

@@ -64,8 +64,8 @@ LEFT_OUT = {
 }
 LEFT_OUT |= {"mecanum": LEFT_OUT["omni"], "tricycle": LEFT_OUT["bicycle"]}
 """Effects that act and are not looked for: on omni robots those of an IMU, which these logs do not have, and
-of lags, currents and a dead zone that the friction of the rollers hides; on cars, whose currents are not logged, a load,
-which looks like softer tyres, and resistances, which look like a smaller radius."""
+of lags, currents and a dead zone that the friction of the rollers hides; on cars, whose currents are not logged, a
+load, which looks like softer tyres, and resistances, which look like a smaller radius."""
 
 #: Response over noise, over that of the clearest channel, from which on one may be named and has to be.
 NOTICEABLE, CLEAR = 0.1, 0.2
