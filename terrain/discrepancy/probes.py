@@ -243,10 +243,9 @@ def _wave_statistics(info: Evidence, c: int, wheel: int) -> dict[float, list[flo
     explained: dict[float, list[float]] = {times: [] for times in (*PLACEBOS, *HARMONICS)}
     for i, run in enumerate(info.rows):
         turned_rad = run.inputs[:, len(INPUTS) - 1 + wheel]
-        phase, rate = (
-            np.outer([*explained], turned_rad),
-            np.gradient(turned_rad),
-        )  # a wheel errs by its own speed
+        if len(turned_rad) < 2:
+            continue
+        phase, rate = np.outer([*explained], turned_rad), np.gradient(turned_rad)  # it errs by its own speed
         waves = _whitened(info, i, c, rate * np.concatenate([np.cos(phase), np.sin(phase)]))
         (products,) = _products(info, i, c, [], waves, (0, phase.shape[1]))
         for k, of_runs in enumerate(explained.values()):

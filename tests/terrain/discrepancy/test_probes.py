@@ -7,6 +7,7 @@ import pytest
 
 from terrain.discrepancy.evidence import grams_of
 from terrain.discrepancy.probes import probe_residuals
+from terrain.discrepancy.runs import INPUTS
 from terrain.effects import CHANNELS
 
 CRAWLING = ("current_a", "crawling direction")
@@ -49,6 +50,17 @@ def test_spikes_at_random_times_are_seen_unless_the_simulation_is_known_to_lack_
     assert known[CRAWLING].z < 1.0
     assert known[CRAWLING].gain == before[CRAWLING].gain
     assert {at for at in before if known[at] != before[at]} == {CRAWLING}
+
+
+def test_a_wheel_out_of_round_is_seen_where_the_body_drives_sideways_or_stands(plain):
+    """By the speed of the wheel itself: an omni wheel rolls where the speed ahead is 0."""
+    phases = [run.inputs[:, len(INPUTS) - 1] for run in plain.rows]
+    c, strange = CHANNELS.index("speed_x_mps"), np.arange(len(CHANNELS)) == CHANNELS.index("speed_x_mps")
+    waves = [np.gradient(phase) * np.sin(phase + i) for i, phase in enumerate(phases)]
+    size = [np.nanstd(run[-1, :, c]) / np.std(wave) for run, wave in zip(plain.white, waves, strict=True)]
+    turned = with_residuals(plain, lambda i, white: white + size[i] * waves[i][:, None] * strange)
+    still = [run._replace(inputs=run.inputs * (np.arange(run.inputs.shape[1]) != 0)) for run in plain.rows]
+    assert probed(replace(turned, rows=tuple(still)))["speed_x_mps", "wheel 1 turn"].significant
 
 
 def test_noise_is_as_significant_as_chance_has_it(plain):
