@@ -220,6 +220,8 @@ def test_trials_take_what_the_catalogue_has_and_what_it_lacks_in_turn():
     names = {each.name for each in library_of("skid_steer")}
     right = {effect.name: {*effect.right} for effect in effects_of("plain", "skid")}
     assert [bool(right[case.effect] & names) for case in cases] == [True, False] * 3
+    scenes_effects = [effect.name for effect in effects_of("mujoco", "skid")]
+    assert [case.effect for case in cases_of("mujoco_skid", len(scenes_effects), 1)] == scenes_effects
     assert {case.world for case in cases_of("nothing", 8, 1)} >= {"skid", "car", "swerve", "omni"}
 
 

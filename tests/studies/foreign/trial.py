@@ -279,7 +279,10 @@ class Case(NamedTuple):
 
 
 def cases_of(row: str, n: int, seed: int) -> list[Case]:
-    """Return ``n`` cases of a row: what the catalogue has and what it lacks in turn, or nothing in worlds in turn."""
+    """Return ``n`` cases of a row: what the catalogue has and what it lacks in turn, or nothing in worlds in turn.
+
+    In scenes of MuJoCo each effect has its turn.
+    """
     if row == "nothing":
         places = [place for place in WORLDS if place[0] == "plain" or find_spec("mujoco")]
         return [Case(row, i, *places[i % len(places)], "", seed) for i in range(n)]
@@ -288,6 +291,8 @@ def cases_of(row: str, n: int, seed: int) -> list[Case]:
     names = {each.name for each in library_of(drive)}
     effects = effects_of(engine, world)
     kinds = [[e.name for e in effects if bool({*e.right} & names) == inside] for inside in (True, False)]
+    if engine == "mujoco":  # hardly any is outside: all in turn
+        kinds = [[effect.name for effect in effects]]
     kinds = [kind for kind in kinds if kind]
     turns = [kinds[i % len(kinds)] for i in range(n)]
     return [
