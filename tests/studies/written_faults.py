@@ -155,6 +155,7 @@ X_AND_Z, Y_AND_Z = {"imu": ("gyro_x", "gyro_z")}, {"imu": ("gyro_y", "gyro_z")}
 DEG, KMH = 180.0 / math.pi, 3.6
 SIDES = {"swapped/wheel speeds": 0.0, "swapped/wheel speeds and currents": 0.0}
 GYRO_SIGN, LAG, RATE = {"sign/gyro": 0.0} | SIDES, "clock_offset_s", "clock_rate_ratio"
+GYRO_DELAY = "gyro behind the wheels"  #: By what is stated of clocks and of the IMU together
 
 FAULTS = (
     Written("gyro sign", "drive_husky", IMU_Z, times(-1), {"sign/gyro": 0.0}),
@@ -208,7 +209,7 @@ FAULTS = (
         "drive_husky",
         IMU_Z,
         late(0.4),
-        {"imu_latency_s": 0.4, LAG: 0.4, "camera_latency_s": -0.4},
+        {GYRO_DELAY: 0.4, "imu_latency_s": 0.4, LAG: 0.4, "camera_latency_s": -0.4},
     ),
     Written(
         "lidar late",
@@ -339,6 +340,8 @@ def stated(diagnosis: Diagnosis) -> tuple[dict[str, float], dict[str, float]]:
     }
     several = {f"{each.kind}/{each.column}": 0.0 for fault in diagnosis.faults for each in fault.rivals}
     named |= diagnosis.values
+    if {"imu_latency_s", LAG} & named.keys():
+        named[GYRO_DELAY] = named.get("imu_latency_s", 0.0) + named.get(LAG, 0.0)
     for values in diagnosis.ambiguous_values.values():
         several |= {value.name: value.value for value in values}
     for cause in diagnosis.candidates:
@@ -366,7 +369,7 @@ def judged(fault: Written, has: set[str], now: Diagnosis | str, before: Diagnosi
                 return True
         return False
 
-    new = {name for name in named if name not in old}
+    new = {name for name in named if name not in old and name != GYRO_DELAY}
     false = {name for name in new if "/" in name and name not in fault.answers}
     if fault.answers.keys() & named.keys() == set() and not answers(several, old_several):
         false |= {name for name in new if name not in fault.answers and name not in old_several}

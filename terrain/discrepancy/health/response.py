@@ -26,7 +26,9 @@ STALLED_RATIO, NOMINAL_RATIO = 0.25, 0.05
 #: second at the least, and far longer than the others.
 STALLED_S, STRETCH_S, ALL_RATIO = 2.0, 1.0, 0.8
 MEAN_S = 0.5  #: Time over which the motion of a body is averaged: noise at rest has no mean.
-MIN_SHOWN_RATIO = 1 / 3  #: Ratio of a stretch in which the body has to be seen at rest.
+MIN_SHOWN_RATIO = (
+    1 / 3
+)  #: Ratio of a stretch in which the body has to be seen at rest, or for a stretch at the least.
 FLOOR = np.array(
     [0.02, 0.015, 0.02]
 )  #: What sensors measure of the motion of a body at rest (rad/s, m/s, rad/s).
@@ -72,7 +74,7 @@ def stalled_runs(
     and a lidar's windows have holes, which a low-pass widens.
 
     Stretches have to be longer by ``extra_s`` where the clock of a run is not known and the run does not follow the
-    wheels on the clock of all: a clock of its own looks like a short stall.
+    wheels on the clock of all: a clock of its own looks like a short stall at the start or the end of a motion.
     """
     if len(runs) < 2:
         return {}
@@ -93,10 +95,14 @@ def stalled_runs(
         shows = (known & asks).any(axis=1)
         # a stall goes on through holes
         stalled = (asks & known.any(axis=0)).any(axis=1) & ~moves
-        least_s = STRETCH_S + (0.0 if clock or (fit[MOTION] > FOLLOWS).any() else extra_s)
+        of_all = clock or (fit[MOTION] > FOLLOWS).any()
+        follows, shows_s = moves & asks.any(axis=1), run.period_s * shows
         for start, end in true_stretches(stalled):
-            lasts = (end - start) * run.period_s >= least_s
-            stalled[start:end] = lasts and shows[start:end].mean() >= MIN_SHOWN_RATIO
+            # a clock of its own delays the start of a motion, or its end: not what is between two parts of one
+            between = start > 0 and end < len(stalled) and follows[start - 1] and follows[end]
+            least_s = STRETCH_S + (0.0 if of_all or between else extra_s)
+            length_s, shown_s = run.period_s * (end - start), shows_s[start:end].sum()
+            stalled[start:end] = length_s >= least_s and shown_s >= min(MIN_SHOWN_RATIO * length_s, STRETCH_S)
         stalls.append((expected, seen, stalled))
         time_s.append(run.period_s * stalled.sum())
         asked_s.append(run.period_s * shows.sum())

@@ -470,6 +470,33 @@ def test_stalled_runs_are_named_also_those_that_stall_later_and_runs_that_scatte
     assert "its body turns at 0.0" in reasons[3]
 
 
+def still_from(run, start_s, end_s, seed=0):
+    """Return a run whose body is at rest meanwhile."""
+    rest = np.random.default_rng(seed)
+
+    def change(t, v):
+        return np.where((t >= start_s) & (t < end_s), rest.normal(0.0, 0.003, v.shape), v)
+
+    return edit(change, **MOTION)(run)
+
+
+def test_a_stall_between_two_parts_of_a_motion_is_shorter_than_one_that_a_clock_makes():
+    runs = runs_of(12, 0.1)
+    runs[3] = still_from(runs[3], 2.4, 5.0)
+    (runs[7],) = with_late_streams([runs[7]], ["imu", "odometry"], 1.8)
+    assert set(stalls(runs)) == {3}
+
+
+def test_a_stall_that_is_seen_through_holes_is_seen_for_a_second():
+    def seen(t, v):
+        return np.where(((t > 1.4) & (t < 2.2)) | (t > 5.3) & (t < 6.1), v, np.nan)
+
+    runs = runs_of(12, 0.1)
+    for i, (start_s, end_s) in {3: (1.2, 6.5), 5: (2.6, 5.2)}.items():
+        runs[i] = edit(seen, **MOTION)(still_from(runs[i], start_s, end_s))
+    assert set(stalls(runs)) == {3}
+
+
 @pytest.mark.parametrize(
     ("others", "named"),
     [
