@@ -13,6 +13,7 @@ from terrain.discrepancy.compared import ComparedRun, compare_runs
 from terrain.discrepancy.gain import gain_of
 from terrain.discrepancy.learner import (
     DRIVEN,
+    _weights,
     cross_validated,
     fitted,
     folds_of,
@@ -113,6 +114,15 @@ def test_the_fewest_products_that_do_are_selected_and_none_in_noise():
         size_of(cross_validated(sums_of(np.random.default_rng(s), 0.0 * truth)), math.inf) for s in range(50)
     ]
     assert np.mean(np.array(nothing) > 0) <= 0.08
+
+
+def test_runs_left_out_are_predicted_as_the_cross_validation_has_it():
+    sums = sums_of(np.random.default_rng(3), np.array([0.5, 0.0, 0.0, -0.5, 0.2, 0.0]))
+    errors, total = cross_validated(sums), sums.sum(axis=0)
+    for own, expected in zip(sums, errors, strict=True):
+        for n in (1, 2, 4):
+            x = np.append(-_weights(total - own, n), 1.0)
+            assert x @ own @ x == pytest.approx(expected[n])
 
 
 def test_a_residual_that_few_products_do_not_reach_gets_as_many_as_have_the_least_error():
