@@ -25,10 +25,10 @@ from pipelines.report.settings import Names, setting
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.tree import Column, Report, Table
 from terrain.deviation import Deviation
-from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, beside_extended
+from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns
-from terrain.discrepancy.gain import HALF, gain_of
-from terrain.discrepancy.learner import ENOUGH, kept_terms
+from terrain.discrepancy.gain import HALF
+from terrain.discrepancy.learner import ENOUGH
 from terrain.effects import CHANNELS
 from terrain.errors import ConfigError, DataError
 from terrain.records import Array, Label, RunLog
@@ -113,8 +113,7 @@ class WholeRow(NamedTuple):
     label: str
     channel: str  #: ``all`` for all of them, by their noise
     named_gain: float
-    all_gain: float  #: with all terms; NaN where no run is held out
-    gain: float  #: with those that are kept
+    gain: float  #: with learned terms; where no run is held out these are not judged
     gain_ci: tuple[float, float]
     learner_gain: float
     coverage: float  #: of the 95 % interval of the replay with those that are kept
@@ -175,31 +174,19 @@ def explain_set(name: str, label: str, runs: Sequence[RunLog]) -> tuple[Row, lis
 def whole_rows(name: str, label: str, found: DiagnosedRuns) -> list[WholeRow]:
     """Return what names and learned terms gain by channel, and what the intervals of the replay cover.
 
-    Which terms the robot keeps is decided on the runs held out, so that their gain there is of those that are kept and
-    of all.  Where no run is held out, terms are not judged.
+    Terms are decided on by the runs that fit them.  Where no run is held out, they are not judged.
     """
     gain, named, behind = found.whole_gain, found.diagnosis.gain, {run.run_id for run in found.fit}
-    judged = [run for run in found.judged if run.run_id not in behind]
-    own = {run.run_id: run for run in found.signals}
-    every = kept_terms(found.learned)
-    last = (found.extended or found.simulation).with_learned(every)
-    beside = [beside_extended(run, own[run.run_id], last, found.low_pass) for run in judged]
-    nothing = [np.full_like(run.residual(True), 0.0) for run in beside]
-    noise = {channel: of.noise for channel, of in found.diagnosis.residual_before.items()}
-    of_all = gain_of(beside, nothing, noise, 0, gain.how) if beside else None
-    held = {run.run_id for run in judged}
-    whole = [run for run in found.whole if run.run_id in held]
+    whole = [run for run in found.whole if run.run_id not in behind]
     says = {shown: each.term.says for shown, each in found.learned.items() if each.term is not None}
     rows = []
     for channel, of in gain.channels.items():
         covered = coverage_of([covered_rows(run, found.deviation, channel) for run in whole])
         before = named.channels[channel].reduction if named and channel in named.channels else np.nan
-        both = of_all.channels[channel].reduction if of_all and channel in of_all.channels else np.nan
-        gains = before, both, of.reduction, of.ci, of.learner_reduction
+        gains = before, of.reduction, of.ci, of.learner_reduction
         rows.append(WholeRow(name, label, channel, *gains, *covered, says.get(channel, "")))
     before = named.reduction if named else np.nan
-    both = of_all.reduction if of_all else np.nan
-    gains = before, both, gain.reduction, gain.ci, gain.learner_reduction
+    gains = before, gain.reduction, gain.ci, gain.learner_reduction
     return [*rows, WholeRow(name, label, ALL, *gains, *UNKNOWN, "")]
 
 
@@ -291,8 +278,7 @@ def report(result: RealSets) -> Report:
         Column("label", of="label"),
         Column("channel", of=lambda row: ALL if row.channel == ALL else CHANNEL_WORDS[row.channel][0]),
         Column("names", ".0%", of="named_gain"),
-        Column("all terms", ".0%", of="all_gain"),
-        Column("kept", ".0%", of="gain"),
+        Column("with terms", ".0%", of="gain"),
         Column("95 %", ".0%", of="gain_ci"),
         Column("learner", ".0%", of="learner_gain"),
         Column("covered", ".0%", of="coverage"),
@@ -300,8 +286,8 @@ def report(result: RealSets) -> Report:
         Column("says", of="says", long=True),
     )
     there = [row for row in result.whole if row.channel == ALL and row.learner_gain > 0.0]
-    worse = [row for row in result.whole if min(row.gain, row.all_gain) < 0.0]
-    worse_by_term = [row for row in result.whole if row.says and row.all_gain < row.named_gain]
+    worse = [row for row in result.whole if row.gain < 0.0]
+    worse_by_term = [row for row in result.whole if row.says and row.gain < row.named_gain]
     covered = [row for row in result.whole if np.isfinite(row.coverage)]
     apart = [row for row in covered if row.coverage_ci[1] < COVERS[0] or row.coverage_ci[0] > COVERS[1]]
     of_terms = (
