@@ -233,7 +233,8 @@ def run(settings: Settings, progress: Progress = silent) -> Result:
 
 def report(result: ServiceResult) -> Report:
     """Return what a service serves, and what it did until its end."""
-    parts = [Pairs(result.pairs("classes", "table", "robots", "robot", "filter"))]
+    about = ("classes", "table", "robots", "robot", "filter") if result.model else ("watch", "table", "robot")
+    parts = [Pairs(result.pairs(*about))]
     needs = [
         (f"{stream}, {result.rate_hz[stream]:g} Hz", enumerated(names))
         for stream, names in result.channels.items()
@@ -249,5 +250,5 @@ def report(result: ServiceResult) -> Report:
         )
         next_step = "terrain convert RECORDINGS --out RUNS makes runs of what was recorded"
         parts.insert(0, Pairs([(name.replace("_", " "), n) for name, n in done.items()]))
-    details = sections(("Channels that the model needs", [Pairs(needs)]))
+    details = sections(("Channels that the model needs", [Pairs(needs)] if needs else []))
     return Report("Service", answer, parts=parts, details=details, next_step=next_step)

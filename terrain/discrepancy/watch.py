@@ -4,10 +4,11 @@ Every :data:`BLOCK_S` the last samples are replayed by the extended model, measu
 as runs are by :mod:`terrain.discrepancy.runs`; a log is the same feed, looped.  A channel with residual ``r`` and
 prediction ``p`` has two figures a block: ``along = sum(r p) / |p|``, of a robot that turns or drives more or less than
 its model, and ``level = sum(r) / sqrt(n)``, of one that is off by an amount.  The gyro minus the yaw rate from poses is
-one more channel.  The file of the model states the variance of each figure in quiet runs, ``noise + scatter e``, where
-``e = sum(p^2)``, of the level the sum of the squared wheel speed.  ``z`` is the figure over its standard deviation, and
-over ``sqrt(memory)``: its long-run variance (Newey and West 1987), as blocks that follow each other are alike, or
-rather the upper limit of it with 95 %.  It is cut off at :data:`CUT`, so that one rogue block is no alarm.
+one more channel.  The file of the model states by how much it is off in quiet runs, which is taken off the figure, and
+the variance of the figure in them, ``noise + scatter e``, where ``e = sum(p^2)``, of the level the sum of the squared
+wheel speed.  ``z`` is the figure over its standard deviation, and over ``sqrt(memory)``: its long-run variance (Newey
+and West 1987), as blocks that follow each other are alike, or rather the upper limit of it with 95 %.  It is cut off at
+:data:`CUT`, so that one rogue block is no alarm.
 
 Each figure has two cumulative sums (Page 1954), ``S = max(0, S +- z - offset - k)``, and is an alarm from ``S >= h``
 until ``S = 0``; ``offset`` bounds the mean that ``z`` has in quiet driving: that of a new session with 95 %, by
@@ -18,6 +19,7 @@ false alarms of a sum is ``(exp(2kb) - 1 - 2kb) / (2 k^2)`` blocks, ``b = h + 1.
 
 from __future__ import annotations
 
+import json
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -66,6 +68,7 @@ LEAST_KNOWN = 0.25  #: Ratio of a block's rows that have to be known.
 LEAST_MOTION = 0.25  #: Ratio of the quiet runs' median ``e`` below which a block does not show a ratio.
 STANDSTILL_MPS = 0.03  #: Of the fastest row of a block.
 N_FITS = 10  #: Of the variance, each weighted by that of the one before.
+LEAST_RATIO = 0.1  #: Of what is usual over the prediction, for a departure in percent.
 MEMORY_BLOCKS = 10  #: Longest memory of blocks.
 OTHER_CLOCK = 0.1  #: Ratio by which the clock may differ from that of the quiet runs.
 SCHEMA = 1  #: Version of the section that is read and written.
@@ -87,6 +90,7 @@ class Status(StrEnum):
 class BlockDeviation(NamedTuple):
     """How far a figure of a channel is from 0 in quiet blocks."""
 
+    bias: float  #: median of the ratio, or of the level, by which the model is off in them; it is taken off the figure
     noise: float  #: variance, in the square of the channel's unit
     scatter: float  #: the same per ``e``
     memory: float  #: long-run variance of the figure over its standard deviation, its upper limit
@@ -301,19 +305,21 @@ def watched_on(runs: Sequence[RunLog], robot: Robot, source: str) -> Watched:
         found += [(run.session, block) for block in blocks_of(run, simulation, clock_hz)]
     deviations = {}
     for of in [(channel, kind) for channel in NAMES for kind in KINDS]:
-        own = [(session, *block.figures[of][:2]) for session, block in found if of in block.figures]
+        own = [(session, *block.figures[of]) for session, block in found if of in block.figures]
         if len(own) >= LEAST_BLOCKS and (each := _deviation(own, of[1])) is not None:
             deviations[of] = each
     return Watched(robot, clock_hz, deviations, source)
 
 
-def _deviation(blocks: Sequence[tuple[str, float, float]], kind: str) -> BlockDeviation | None:
-    """Return the deviation over blocks in order (session, figure, ``e``); None where they do not show the figure."""
+def _deviation(blocks: Sequence[tuple[str, float, float, float]], kind: str) -> BlockDeviation | None:
+    """Return the deviation over blocks in order (session and :attr:`Block.figures`); None where they do not show it."""
     sessions, *numbers = zip(*blocks, strict=True)
-    figure, e = np.array(numbers)
+    figure, e, whole = np.array(numbers)
     least = LEAST_MOTION * float(np.median(e)) if kind == "along" else 0.0
     shows = e >= least
-    figure, e, of_session = figure[shows], e[shows], np.array(sessions)[shows]
+    figure, e, whole, of_session = figure[shows], e[shows], whole[shows], np.array(sessions)[shows]
+    bias = float(np.median(figure / np.sqrt(whole))) if len(figure) else 0.0
+    figure = figure - bias * np.sqrt(whole)
     n, square = len(figure), figure**2
     if n < LEAST_BLOCKS or not square.any():
         return None
@@ -333,7 +339,7 @@ def _deviation(blocks: Sequence[tuple[str, float, float]], kind: str) -> BlockDe
     offset = abs(float(means[0])) + 2.0 / math.sqrt(n)  # of one session nothing tells how others differ
     if len(means) > 1:
         offset = float(student.ppf(0.975, len(means)) * np.sqrt(np.mean(means**2)))
-    return BlockDeviation(float(growth[0]), float(growth[1]), memory, spread, offset, least, n)
+    return BlockDeviation(bias, float(growth[0]), float(growth[1]), memory, spread, offset, least, n)
 
 
 def _memory(left: Array, places: Array) -> tuple[float, float]:
@@ -355,7 +361,7 @@ def watch_lines(watched: Watched) -> list[str]:
     lines = [
         "watch:",
         f"  schema: {SCHEMA}",
-        f"  source: {watched.source}",
+        f"  source: {json.dumps(watched.source)}",
         f"  clock_hz: {watched.clock_hz:.7g}",
     ]
     lines.append("  deviations:")
@@ -405,8 +411,8 @@ def read_watched(path: str | Path) -> Watched:
         if channel not in NAMES or kind not in KINDS:
             raise ConfigError(f"{place}: {shown(name)} is no channel and kind ({' or '.join(KINDS)})")
         check_keys(f"{place}: {name}", entry, [*BlockDeviation._fields])
-        if not all(is_number(value) and value >= 0.0 for value in entry.values()):
-            raise ConfigError(f"{place}: {name}: numbers from 0 up are required")
+        if not all(is_number(value) and (value >= 0.0 or key == "bias") for key, value in entry.items()):
+            raise ConfigError(f"{place}: {name}: finite numbers are required, from 0 up but for the bias")
         each = BlockDeviation(**entry)
         if not each.memory >= each.spread > 0.0 or not each.noise > 0.0:
             raise ConfigError(
@@ -556,11 +562,15 @@ class Watch:
         for of, each in self.watched.deviations.items():
             figure, e, whole = block.figures.get(of, (math.nan, 0.0, 0.0))
             if e >= each.least and math.isfinite(figure):
+                figure -= each.bias * math.sqrt(whole)
                 z = figure / math.sqrt((each.noise + each.scatter * e) * each.memory)
                 z = max(-CUT, min(CUT, z))
+                off = figure * math.sqrt(whole)
+                if of[1] == "along":  # a ratio of what is usual, not of the prediction
+                    whole *= max(1.0 + each.bias, LEAST_RATIO)
                 for side in (1, -1):
                     step = side * z - each.offset - REFERENCE
-                    self._add((*of, side), step, block.start_s, figure * math.sqrt(whole), whole)
+                    self._add((*of, side), step, block.start_s, off, whole)
                 seen[of[0]] = True
         departing = {channel for channel, _, _ in self._open}
         for channel, is_seen in seen.items():

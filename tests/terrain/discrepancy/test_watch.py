@@ -77,7 +77,9 @@ def test_no_more_false_alarms_than_stated(session_std):
     rng, hours = np.random.default_rng(5), 25
     quiet = []
     for session in range(5):
-        quiet += [(str(session), *pair) for pair in zip(*quiet_numbers(rng, 60, session_std), strict=True)]
+        quiet += [
+            (str(session), *pair, pair[1]) for pair in zip(*quiet_numbers(rng, 60, session_std), strict=True)
+        ]
     of = [("yaw_rate_radps", "along"), ("speed_x_mps", "along")]
     watch = Watch(Watched(HUSKY, 20.0, dict.fromkeys(of, _deviation(quiet, "along")), ""), false_alarm_h=1.0)
     for hour in range(hours):
@@ -111,7 +113,7 @@ def test_a_hidden_change_is_found(hide, watched, hidden, channel, size):
     watch, first_s = watch_runs(watched, hide(hidden, n=12, seed=12))
     assert first_s < 300.0
     sizes = [alarm.size for alarm in watch.alarms if (alarm.channel, alarm.kind) == (channel, "along")]
-    assert sizes == [pytest.approx(size, rel=0.2)]
+    assert sizes == [pytest.approx(size, rel=0.2, abs=0.03)]  # runs differ by some hundredths
 
 
 def test_an_alarm_is_held_until_the_departure_is_over(hide, watched):
@@ -192,6 +194,19 @@ def test_nonsense_is_no_alarm_and_raises_nothing(watched, long_run, values):
     assert not watch.alarms
 
 
+def test_what_the_model_is_usually_off_by_is_no_departure(hide):
+    """A model without the tenth that its robot turns less is watched as well as the right one."""
+    usual = {"effective_track_ratio": 0.1}
+    watched = watched_on(hide(usual, n=12, seed=3), HUSKY, "a robot that turns less")
+    assert watched.deviations["yaw_rate_radps", "along"].bias == pytest.approx(1 / 1.1 - 1, abs=0.02)
+    assert not watch_runs(watched, hide(usual, n=12, seed=11))[0].alarms
+    watch, _ = watch_runs(watched, hide({}, n=12, seed=12))
+    sizes = [
+        alarm.size for alarm in watch.alarms if (alarm.channel, alarm.kind) == ("yaw_rate_radps", "along")
+    ]
+    assert sizes == [pytest.approx(0.1, rel=0.3)]
+
+
 # -- Measured runs ----------------------------------------------------------------------------------------------
 
 DRIVE_HUSKY = {
@@ -243,7 +258,7 @@ def test_a_section_is_read_as_it_was_written(described, watched):
 
 
 HEAD = "watch:\n  schema: 1\n  source: me\n  clock_hz: 20\n  deviations:\n"
-ENTRY = "{noise: 1.0, scatter: 0.0, memory: 1.0, spread: 1.0, offset: 0.1, least: 0.0, blocks: 9}"
+ENTRY = "{bias: -0.1, noise: 1.0, scatter: 0.0, memory: 1.0, spread: 1.0, offset: 0.1, least: 0.0, blocks: 9}"
 
 
 @pytest.mark.parametrize(
@@ -257,8 +272,11 @@ ENTRY = "{noise: 1.0, scatter: 0.0, memory: 1.0, spread: 1.0, offset: 0.1, least
         (f"{HEAD}    speed_x_mps: {ENTRY}\n", "'speed_x_mps' is no channel and kind"),
         (f"{HEAD}    speed level: {ENTRY}\n", "'speed level' is no channel and kind"),
         (HEAD, "one by channel and kind is required"),
-        (f"{HEAD}    speed_x_mps level: {ENTRY}\n".replace("0.1", "-1"), "numbers from 0 up"),
-        (f"{HEAD}    speed_x_mps level: {ENTRY}\n".replace("noise: 1.0", "noise: .nan"), "numbers from 0 up"),
+        (f"{HEAD}    speed_x_mps level: {ENTRY}\n".replace("0.1", "-1"), "finite numbers are required"),
+        (
+            f"{HEAD}    speed_x_mps level: {ENTRY}\n".replace("noise: 1.0", "noise: .nan"),
+            "finite numbers are required",
+        ),
         (f"{HEAD}    speed_x_mps level: {ENTRY}\n".replace("noise: 1.0", "noise: 0"), "above 0 are required"),
         (f"{HEAD}    speed_x_mps level: {ENTRY}\n".replace("noise: 1.0, ", ""), "noise"),
     ],
