@@ -23,10 +23,8 @@ The section ``learned`` of a robot's description::
           coefficients: {"abs(speed_mps) * max(turn_radps - 0.8, 0)": -0.31}
           covariance: [[0.0004]]
           region: {speed_mps: [-1.0, 1.5], turn_radps: [-1.2, 1.3]}
-          left_std: 0.02
 
-A coefficient has the unit of the channel over that of its product; ``left_std`` is the standard deviation that a
-term leaves beside the noise, in the channel's unit.
+A coefficient has the unit of the channel over that of its product.
 
 Source of the family: Friedman, Multivariate adaptive regression splines, Annals of Statistics 1991 (products of
 hinges, selected one after the other).
@@ -232,7 +230,6 @@ class LearnedTerm:
     coefficients: Array  #: (k,) of the products
     covariance: Array  #: (k, k) of the coefficients
     region: Mapping[str, tuple[float, float]]  #: range of each input that it depends on
-    left_std: float  #: standard deviation that is left beside the noise, in the channel's unit
     says: str = ""  #: where it acts, in words
     source: str = "assumed"
 
@@ -258,8 +255,6 @@ class LearnedTerm:
         covariance = checked_covariance(f"{place}: covariance", np.asarray(self.covariance, dtype=float))
         if covariance.shape != (n, n):
             raise ConfigError(f"{place}: covariance has the shape {covariance.shape}, {(n, n)} is required")
-        if not 0.0 <= self.left_std < math.inf:
-            raise ConfigError(f"{place}: left_std is {self.left_std!r}, a number from 0 up is required")
         object.__setattr__(self, "coefficients", read_only(coefficients))
         object.__setattr__(self, "covariance", covariance)
 
@@ -393,7 +388,7 @@ def where_it_acts(channel: str, products: Sequence[str], added: Array, inputs: A
 
 # -- The section of a description ------------------------------------------------------------------------------
 
-_KEYS = ["channel", "says", "source", "coefficients", "covariance", "region", "left_std"]
+_KEYS = ["channel", "says", "source", "coefficients", "covariance", "region"]
 DIGITS = 7  #: Significant digits of each number that is written.
 
 
@@ -428,7 +423,7 @@ def _read_term(place: str, entry: Any) -> LearnedTerm:
         raise ConfigError(f"{place}: region is {shown(region)}, two numbers by input are required")
     if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == len(rows) for row in rows):
         raise ConfigError(f"{place}: covariance is {shown(rows)}, rows of as many numbers are required")
-    for number in [*coefficients.values(), *[each for row in rows for each in row], entry["left_std"]]:
+    for number in [*coefficients.values(), *[each for row in rows for each in row]]:
         if not is_number(number):
             raise ConfigError(f"{place}: {shown(number)} is no finite number")
     for product in coefficients:
@@ -443,7 +438,6 @@ def _read_term(place: str, entry: Any) -> LearnedTerm:
             coefficients=np.array([*coefficients.values()], dtype=float),
             covariance=np.array(rows, dtype=float),
             region={name: (float(pair[0]), float(pair[1])) for name, pair in region.items()},
-            left_std=float(entry["left_std"]),
             says=entry["says"],
             source=entry["source"],
         )
@@ -474,5 +468,4 @@ def _written(term: LearnedTerm) -> dict[str, Any]:
         "coefficients": dict(numbers),
         "covariance": [[rounded(each) for each in row] for row in term.covariance.tolist()],
         "region": {name: [rounded(low), rounded(high)] for name, (low, high) in term.region.items()},
-        "left_std": rounded(term.left_std),
     }

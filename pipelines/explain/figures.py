@@ -50,8 +50,8 @@ def run_figure(run: ComparedRun, deviation: Deviation, channels: Sequence[str]) 
     title = f"{run.run_id}{f', {run.terrain}' if run.terrain else ''}{held_out}"
     caption = (
         f"The prediction of the simulation from the logged wheels, steering and tilt, beside the measurement; "
-        f"the band about {BEFORE if run.after is None else AFTER} is to hold 95 % of a run that it was not fitted to, "
-        "by the runs behind it. All have passed the same low-pass."
+        f"the band about {BEFORE if run.after is None else AFTER} is that of 95 % of a further run, by the runs behind "
+        "the fit, each left out of it in turn. All have passed the same low-pass."
     )
     return Figure(title, panels, caption, x_label="time in the run [s]")
 

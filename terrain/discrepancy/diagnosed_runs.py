@@ -133,9 +133,7 @@ def diagnose_runs(
     last = extended or simulation
     info = problem.at(last.vector)
     noise = without_levels(info.noise, compared)
-    learned = learn_terms(
-        last, problem.signals, compared, problem.low_pass, noise, scatter_square(info), seed
-    )
+    learned = learn_terms(last, problem.signals, compared, problem.low_pass, scatter_square(info), seed)
     gains: tuple[LearnedGain, ...] = ()
     with_terms, whole, whole_gain = last.with_learned(kept_terms(learned)), judgement.runs, judgement.gain
     if with_terms is not last and not on.in_turn:

@@ -18,7 +18,6 @@ nothing of a term.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations, combinations_with_replacement
@@ -30,7 +29,6 @@ from scipy.stats import t as student
 from terrain.discrepancy.compared import ComparedRun
 from terrain.discrepancy.evidence import Evidence
 from terrain.discrepancy.gain import Gain, Interval, removed_by
-from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.runs import (
     LowPass,
     Signals,
@@ -137,7 +135,6 @@ class Learned(NamedTuple):
     #: part of the square, before the causes, that causes and term remove in the inner folds
     inner_gain: float
     reference_gain: float  #: that the black-box reference removes there; NaN where there are too few runs
-    left_std: float  #: beside the noise, of what is left there, in the channel's unit
     #: by run (m,), what the term adds to its rows over what it would without the run's group
     left_out: Mapping[str, Array]
 
@@ -147,7 +144,6 @@ def learn_terms(
     signals: Sequence[Signals],
     compared: Sequence[ComparedRun],
     low_pass: LowPass,
-    noise: Noise,
     scatter: Array,
     seed: int = 0,
 ) -> dict[str, Learned]:
@@ -190,10 +186,9 @@ def learn_terms(
             rows.append(seen)
             table = np.hstack([seen, left[:, [CHANNELS.index(shown)]]])
             table = table[np.isfinite(table).all(axis=1)]
-            grams.append((table.T @ table, len(table)))
+            grams.append(table.T @ table)
         sums = np.zeros((groups.max() + 1, len(products) + 1, len(products) + 1))
-        np.add.at(sums, groups, np.array([gram for gram, _ in grams]))
-        n_rows = sum([n for _, n in grams])
+        np.add.at(sums, groups, np.array(grams))
         c = CHANNELS.index(shown)
         before = sum(float(np.nansum(run.residual(False)[:, c] ** 2)) for run in compared)
         there = sums[:, -1, -1] > 0.0
@@ -205,10 +200,7 @@ def learn_terms(
         n = size_of(errors, (1.0 - ENOUGH) * before + ENOUGH * reference)
         by_chance = CHANCE / len(runs) * float(scatter[c])
         n = n if errors[:, 0].sum() - errors[:, n].sum() > by_chance else 0
-        n = n if left_out_gain(np.array([gram for gram, _ in grams]), folds, n) > 0.0 else 0
-        sizes = np.concatenate([noise.size(run.pace_mps)[:, c] for run in compared])
-        noise_std = float(np.sqrt(np.nanmean(sizes**2)))
-        left_std = math.sqrt(max(float(errors[:, n].sum()) / n_rows - noise_std**2, 0.0))
+        n = n if left_out_gain(np.array(grams), folds, n) > 0.0 else 0
         term, left_out = None, {}
         if n:
             total = sums.sum(axis=0)
@@ -216,7 +208,7 @@ def learn_terms(
             coefficients, covariance = fitted(sums, chosen)
             names = tuple(products[i] for i in chosen)
             used = region_of_term(names, ranges)
-            term = LearnedTerm(channel, names, coefficients, covariance, used, left_std)
+            term = LearnedTerm(channel, names, coefficients, covariance, used)
             added = [term.predict(inputs, np.full(len(inputs), dt))[0] for dt, inputs in steps_inputs]
             term = replace(term, says=where_it_acts(channel, names, np.concatenate(added), every))
             simulation = simulation.with_learned([term])
@@ -225,7 +217,7 @@ def learn_terms(
             change = [_weights(total, n) - each for each in without]
             left_out = {run.run_id: seen @ change[g] for run, seen, g in zip(runs, rows, group, strict=True)}
         inner_gain, reference_gain = (1.0 - np.array([errors[:, n].sum(), reference]) / before).tolist()
-        learned[shown] = Learned(term, inner_gain, reference_gain, left_std, left_out)
+        learned[shown] = Learned(term, inner_gain, reference_gain, left_out)
     return learned
 
 

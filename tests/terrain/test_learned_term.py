@@ -31,9 +31,7 @@ WIDE = {"speed_mps": (-2.0, 2.0), "turn_radps": (-2.0, 2.0)}
 
 def term(channel, products, values, region=WIDE, std=0.01):
     cov = std**2 * np.eye(len(products))
-    return LearnedTerm(
-        channel, tuple(products), np.array(values), cov, region, 0.02, "what it does", "a test"
-    )
+    return LearnedTerm(channel, tuple(products), np.array(values), cov, region, "what it does", "a test")
 
 
 LOSS = term(SPEED_X, ["speed_mps * max(turn_radps, 0)", "change(speed_mps, 0.3)"], [-0.4, 0.1])
@@ -244,7 +242,7 @@ def test_a_robot_is_written_and_read_with_its_terms(tmp_path):
         )
         np.testing.assert_allclose(one.coefficients, other.coefficients)
         np.testing.assert_allclose(one.covariance, other.covariance)
-        assert (dict(one.region), one.left_std) == (dict(other.region), other.left_std)
+        assert dict(one.region) == dict(other.region)
     (tmp_path / "mine.yaml").write_text(text)
     again = extended_yaml(tmp_path / "mine.yaml", {}, np.empty((0, 0)), {}, "me")
     assert "learned:" not in again
@@ -270,7 +268,6 @@ def test_a_robot_is_written_and_read_with_its_terms(tmp_path):
         ({"region": {}}, "no range, turn_radps is required"),
         ({"region": {"turn_radps": [1.0, -1.0]}}, "not two rising finite numbers"),
         ({"region": {"turn_radps": [1.0]}}, "two numbers by input"),
-        ({"left_std": -1.0}, "left_std is -1.0"),
         ({"gain": 1.0}, "key 'gain' is unknown"),
     ],
 )

@@ -170,7 +170,7 @@ def test_an_extended_description_passes_through_the_commands(tmp_path):
     assert LivePilot(robot).control._radius_m == pytest.approx(0.208)
     with pytest.raises(ConfigError, match="is extended by effects"):
         calibrate.run(calibrate.Settings(data=tmp_path, robot=str(out)), silent)
-    term = LearnedTerm(SPEED_X, ("speed_mps",), np.array([0.1]), np.eye(1), {"speed_mps": (0.0, 1.0)}, 0.01)
+    term = LearnedTerm(SPEED_X, ("speed_mps",), np.array([0.1]), np.eye(1), {"speed_mps": (0.0, 1.0)})
     out.with_name("learned.yaml").write_text(
         extended_yaml("agrimaro", {}, np.zeros((0, 0)), {}, "", learned=[term])
     )

@@ -155,7 +155,7 @@ def test_what_runs_differ_by_at_random_is_no_law_of_them(hide, pose):
     simulation, low_pass = problem.simulation, problem.low_pass
     info = problem.at(simulation.vector)
     compared = compare_runs(simulation, None, problem.signals, low_pass)
-    about = simulation, problem.signals, compared, low_pass, info.noise
+    about = simulation, problem.signals, compared, low_pass
     square = scatter_square(info)
     assert square[T] > 0.0
     assert learn_terms(*about, square)["turning_current_a"].term is not None
