@@ -13,10 +13,10 @@ import numpy as np
 from terrain.deviation import Deviation
 from terrain.discrepancy.compared import ComparedRun, beside_extended, compare_runs, without_levels
 from terrain.discrepancy.constancy import PartValues, part_values, rogues_among
-from terrain.discrepancy.diagnose import check_ids, find_causes, judged, statement_of
+from terrain.discrepancy.diagnose import Found, check_ids, find_causes, judged, statement_of
 from terrain.discrepancy.earned import MIN_RUNS, crossed_runs, held_out_runs, units_of
 from terrain.discrepancy.gain import Gain
-from terrain.discrepancy.grounds import simulation_for
+from terrain.discrepancy.grounds import is_better, simulation_for
 from terrain.discrepancy.held_out import Comparison, filter_gain, repair_held_out, split_runs
 from terrain.discrepancy.learner import (
     Learned,
@@ -37,7 +37,7 @@ from terrain.discrepancy.runs import (
     in_order,
 )
 from terrain.discrepancy.verdict import INTERVAL_T, Diagnosis
-from terrain.effects import Effect
+from terrain.effects import CHANNELS, Effect
 from terrain.errors import ConfigError, DataError
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.records import Array, RunLog
@@ -111,8 +111,7 @@ def diagnose_runs(
         raise DataError(f"runs: only {len(by_id)} of {len(runs)} can be compared ({why})")
     used, held_out = split_runs([run for run in runs if run.run_id in by_id], hold_out, seed)
     given = [by_id[run.run_id] for run in used]
-    simulation, terrains = simulation_for(used, robot, library, given)
-    found = find_causes(used, simulation, library, given)
+    found, simulation, terrains = found_on_ground(used, robot, library, given)
     problem = found.problem
     about = simulation, problem.low_pass, found.noise, seed
     on = None
@@ -167,6 +166,33 @@ def diagnose_runs(
         whole_gain=whole_gain,
         deviation=deviation_of(compared, left, units_of(compared), problem.low_pass),
     )
+
+
+def found_on_ground(
+    runs: Sequence[RunLog], robot: Robot, library: Sequence[Effect], signals: Sequence[Signals]
+) -> tuple[Found, Simulation, tuple[TerrainMatch, ...]]:
+    """Return what was found on the soils of the labels, or on the default ground, and the terrain of each label.
+
+    With what is named on it a soil has to leave clearly less of the runs behind the fit than the default ground does.
+    """
+    simulation, terrains = simulation_for(runs, robot, library, signals)
+    found = find_causes(runs, simulation, library, signals)
+    if not any(match.soil for match in terrains):
+        return found, simulation, terrains
+    plain, on_default = simulation_for(runs, robot, library, signals, on_soils=False)
+    other = find_causes(runs, plain, library, signals)
+    noise = np.array([other.noise.get(name, np.inf) for name in CHANNELS])
+
+    def left_by(each: Found) -> dict[str, float]:
+        compared = compare_runs(each.extended, None, each.problem.signals, each.problem.low_pass)
+        return {run.run_id: float(np.nansum((run.residual(False) / noise) ** 2)) for run in compared}
+
+    on_soils, without = left_by(found), left_by(other)
+    both = [run for run in other.problem.signals if run.run_id in on_soils]
+    loss, loss_without = (np.array([left[run.run_id] for run in both]) for left in (on_soils, without))
+    if is_better(loss, loss_without, units_of(both)):
+        return found, simulation, terrains
+    return other, plain, on_default
 
 
 def held_out_gain(diagnosed: DiagnosedRuns, robot: Robot, seed: int) -> HeldOutGain:

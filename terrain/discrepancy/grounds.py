@@ -2,7 +2,10 @@
 
 A label is a hypothesis.  The soil of the package of that name competes with the default ground, and is taken where
 runs left out of the fit are predicted clearly better on it while everything that the library may change, within its
-plausible range, is fitted with both.  Ties go to the default ground, so that a label by itself changes nothing.
+plausible range, is fitted with both.  Ties go to the default ground, so that a label by itself changes nothing.  With
+what is named on either the soil has to be clearly better, too
+(:func:`terrain.discrepancy.diagnosed_runs.found_on_ground`): where thirty parameters repair a soil and no few do, it is
+not that of the runs.
 
 On any ground a part of the measured tilt acts as a slope: a tilt that is none, of a body that rides over bumps, takes
 no traction; simulated as a slope it biases mass, resistance and slip.
@@ -60,15 +63,16 @@ def simulation_for(
     robot: Robot,
     library: Sequence[Effect],
     signals: Sequence[Signals] | None = None,
+    on_soils: bool = True,
 ) -> tuple[Simulation, tuple[TerrainMatch, ...]]:
     """Return the simulation of runs, and the terrain that each of their labels is simulated on.
 
-    The ``signals`` of the runs are taken where they are known already.
+    The ``signals`` of the runs are taken where they are known already; without ``on_soils`` no label is a soil.
     """
     labels = sorted({run.terrains[0] if len(run.terrains) == 1 else "" for run in runs})
     scatter = spread_numbers("scatter")
     simulation = Simulation(robot, Ground(), robot.effects, scatter, learned=robot.learned)
-    known = {*soil_names(), *packaged(EXTRA)}
+    known = {*soil_names(), *packaged(EXTRA)} if on_soils else set()
     every = [signals_of(run, robot) for run in runs] if signals is None else signals
     grounds, soils = {}, set()
     for label in labels:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from studies.blind_trials.drives import rich_drives
 from studies.blind_trials.trial import hidden_runs
+from studies.foreign.worlds import WORLDS, driven_by, runs_of
 
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.diagnosed_runs import diagnose_runs
@@ -165,6 +166,30 @@ def test_of_a_set_the_member_of_a_usual_size_is_built_in_whatever_the_label(tmp_
         assert [{"wheel_radius", "ground_slip"} <= set(names) for names in diagnosis.ambiguous_sets] == [True]
         found.append((diagnosis.ambiguous_sets, track))
     assert found[0] == found[1]
+
+
+@pytest.mark.slow
+def test_a_soil_that_only_all_parameters_together_repair_is_not_that_of_the_runs(tmp_path):
+    """A light robot of a foreign simulator, its speeds logged by another radius: on grass thirty parameters fit, no few."""
+    path = tmp_path / "light.yaml"
+    path.write_text(LIGHT)
+    robot, world = load_robot(path), WORLDS["plain", "skid"]()
+    places = np.array([[x, y] for x in (0.131, -0.131) for y in (0.188, -0.188)])
+    body = world.body._replace(wheels_m=places, radius_m=np.full(4, 0.098), mass_kg=17.0, inertia_kgm2=0.45)
+    world = world._replace(body=body, sensing=world.sensing._replace(lidar_m=(0.0, 0.0)))
+    given = []
+    for run in runs_of(world, driven_by(world, 24, np.random.default_rng(7)), np.random.SeedSequence(7)):
+        wheels = run.streams["wheels"]
+        speeds = replace(wheels, values=wheels.values[:, :2], channels=wheels.channels[:2])
+        given.append(RunLog(run.run_id, robot.name, {**run.streams, "wheels": speeds}))
+    found = []
+    for label in ("zork", "grass"):
+        diagnosis = diagnose_runs(
+            relabelled(given, label), robot, library_of("skid_steer"), None, 0
+        ).diagnosis
+        found.append({value.name: value.value for cause in diagnosis.causes for value in cause.parameters})
+    assert found[0] == found[1]
+    assert found[0]["ground_slip_ratio"] == pytest.approx(1.0 - 0.098 / 0.165, abs=0.01)
 
 
 def test_a_label_that_helps_no_run_changes_nothing():
