@@ -170,7 +170,7 @@ def test_of_a_set_the_member_of_a_usual_size_is_built_in_whatever_the_label(tmp_
 
 @pytest.mark.slow
 def test_a_soil_that_only_all_parameters_together_repair_is_not_that_of_the_runs(tmp_path):
-    """A light robot of a foreign world, its speeds logged by another radius: on grass thirty parameters fit, no five."""
+    """A light robot of a foreign world, speeds logged by another radius: on grass thirty parameters fit, no five."""
     path = tmp_path / "light.yaml"
     path.write_text(LIGHT)
     robot, world = load_robot(path), WORLDS["plain", "skid"]()
