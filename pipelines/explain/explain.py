@@ -16,6 +16,7 @@ from terrain.errors import ConfigError
 if TYPE_CHECKING:
     from pipelines.explain.explanation import ExplainResult
     from pipelines.report.results import Progress
+    from terrain.discrepancy.watch import Watched
     from terrain.records import RunLog
     from terrain.robots import Robot
 
@@ -57,8 +58,7 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
     from pipelines.explain.statements import sources_of
     from terrain.discrepancy.diagnosed_runs import extended_effects
     from terrain.discrepancy.next_drive import NEXT_FILE, commands_of, next_command
-    from terrain.discrepancy.runs import in_order
-    from terrain.discrepancy.watch import watch_lines, watched_on
+    from terrain.discrepancy.watch import watch_lines
     from terrain.extension import extended_yaml
     from terrain.files.atomic import atomic_write, ensure_writable
     from terrain.robots import load_robot
@@ -108,11 +108,7 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
     if result.extended_file is not None:
         effects = extended_effects(tested, result.diagnosis)
         sources, about = sources_of(result.diagnosis, settings.dataset or "a data set"), result.extended
-        judged = {run.run_id for run in result.diagnosed.judged}
-        held_out = [run for run in result.diagnosed.held_out if run.run_id in judged]
-        quiet = in_order([*result.diagnosed.fit, *held_out])
-        of = f"terrain explain, {len(quiet)} runs of {settings.dataset or 'a data set'}"
-        watched = watched_on(quiet, about, f"{of}, {len(held_out)} of them held out")
+        watched, _ = watched_of(result, settings.dataset)
         text = extended_yaml(
             description, *effects, sources, about.region, about.learned, about.deviation, watch_lines(watched)
         )
@@ -123,6 +119,18 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
         atomic_write(out / NEXT_FILE, commands_of(drive))
     result.report.save(out / PAGE_FILE)
     return result
+
+
+def watched_of(found: ExplainResult, data: str) -> tuple[Watched, list[RunLog]]:
+    """Return the extended robot as it is watched, and the runs by which: those behind the diagnosis and held out."""
+    from terrain.discrepancy.runs import in_order
+    from terrain.discrepancy.watch import watched_on
+
+    judged = {run.run_id for run in found.diagnosed.judged}
+    held_out = [run for run in found.diagnosed.held_out if run.run_id in judged]
+    quiet = in_order([*found.diagnosed.fit, *held_out])
+    source = f"terrain explain, {len(quiet)} runs of {data or 'a data set'}, {len(held_out)} of them held out"
+    return watched_on(quiet, found.extended, source), quiet
 
 
 def explain(

@@ -14,11 +14,24 @@ import pytest
 
 from pipelines.report.results import Result
 from pipelines.report.tree import Report
-from studies import ablation, consistency, figures, intervals, labels, long_drives, mutants, scale, trials
+from studies import (
+    ablation,
+    consistency,
+    figures,
+    intervals,
+    labels,
+    long_drives,
+    mutants,
+    scale,
+    trials,
+    watching,
+)
 from studies.__main__ import STUDIES, main
-from studies.blind_trials.trial import Row
+from studies.blind_trials.drives import rich_drives
+from studies.blind_trials.trial import Row, hidden_runs
 from terrain.bootstrap import proportion_interval
 from terrain.errors import ConfigError, DataError
+from terrain.logs.run_folders import write_run
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.robots import load_robot
 
@@ -270,3 +283,17 @@ def test_what_is_not_accepted_is_exit_code_1(monkeypatch):
 
     monkeypatch.setattr("studies.soak.run", lambda settings, progress: Bad())
     assert main(["soak"]) == 1
+
+
+@pytest.mark.slow
+def test_watched_runs_agree_until_they_are_changed(tmp_path):
+    drives = rich_drives(np.random.default_rng(3), 9, 30.0)
+    for run in hidden_runs(load_robot("husky"), drives, np.random.SeedSequence(3), {"camera_yaw_rad": 0.04}):
+        write_run(run, tmp_path)
+    found = watching.run(watching.Settings(data=tmp_path, robot="husky", hours=1.0))
+    rows = {row.change: row for row in found.rows}
+    assert found.n_quiet == 6
+    assert rows["none"].alarms == 0
+    assert rows["none"].compared_s >= 70.0
+    assert rows["gyro +20 %"].first_alarm_s < rows["gyro +10 %"].first_alarm_s < np.inf
+    assert "turns" in rows["gyro +20 %"].says
