@@ -48,7 +48,7 @@ def against_parts(against: Against, name: str, robot: Robot) -> Iterator[Part]:
     rows = []
     for each in against.differences:
         for k, value in enumerate(each.parameters):
-            first = robot.effects.get(value.name, 0.0) + each.first[k].value
+            first = each.first[k].value
             rows.append(
                 (
                     *(("", None) if k else (effect_label(each.name), each.z)),

@@ -1,49 +1,34 @@
 """What changed between two sets of runs of one robot: deflated tyres, a load, another floor.
 
 Both sets are fitted together.  Each effect has a value that both share, and its difference, which acts in the second
-set alone, is a candidate: one column of the evidence more, zero in the runs of the first set.  Differences are added
-while one is significant and gains on runs left out of the fit, as causes are in :mod:`terrain.discrepancy.search`;
-clusters are runs, or sessions where each set has several.  One whose gain beside the others, on runs held out, has an
-interval that holds 0 is a candidate.  What both sets have in common, known or not, is in neither column and cancels.
+set alone, is an effect of its own (:mod:`terrain.discrepancy.differences`), searched as causes are
+(:mod:`terrain.discrepancy.search`) beside the causes of both.  Clusters are runs, or sessions where each set has
+several.  A difference whose gain beside the others, on runs held out, has an interval that holds 0 is a candidate.
+What both sets have in common, known or not, is in neither column and cancels.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import t as student
 
+from terrain.discrepancy.diagnose import shown_channels, values_of
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns
+from terrain.discrepancy.differences import INDEX, MORE, PARAMETER, difference, in_common
 from terrain.discrepancy.earned import fit_to_judge
-from terrain.discrepancy.evidence import (
-    TRUST_DOF,
-    Z_EFFECT,
-    Evidence,
-    clustered_variance,
-    partial_information,
-    z_of,
-    z_of_t,
-)
+from terrain.discrepancy.evidence import Evidence, move_point
 from terrain.discrepancy.gain import ratio_of_sums
 from terrain.discrepancy.held_out import HOLD_OUT_EVERY, HOLD_OUT_FROM, repair_held_out
 from terrain.discrepancy.patterns import evidence_of_parts
 from terrain.discrepancy.probes import Z_PROBE, input_values
-from terrain.discrepancy.runs import (
-    Excluded,
-    Signals,
-    Simulation,
-    comparable,
-    in_order,
-    low_pass_of,
-)
-from terrain.discrepancy.search import CLOSE_GAIN, MAX_FITTED, RIVAL_LOSS, Problem, names_of
-from terrain.discrepancy.verdict import Unexplained, Value
-from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect
+from terrain.discrepancy.runs import Excluded, Signals, Simulation, comparable, in_order, low_pass_of
+from terrain.discrepancy.search import CauseFit, Problem, names_of, refit, relinearize, rivals_of, search_on
+from terrain.discrepancy.verdict import INTERVAL_T, Unexplained, Value
+from terrain.effects import CHANNELS, Effect
 from terrain.errors import DataError
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.records import Array, RunLog
@@ -51,7 +36,6 @@ from terrain.robots import Robot
 
 MIN_RUNS = 3  #: Least number of runs of a set: fewer do not show their scatter
 MAX_DIFFERENCES = 5  #: More of them, and the second set is of another robot
-N_STEPS = 3  #: Sensitivities are taken anew so often at the values of each set
 MIN_SESSIONS = 2  #: Of each set, for sessions to be the clusters
 
 
@@ -60,7 +44,7 @@ class Difference(NamedTuple):
 
     name: str
     parameters: tuple[Value, ...]  #: of the second set minus the first
-    first: tuple[Value, ...]  #: in the first set, over what the simulation has of them already
+    first: tuple[Value, ...]  #: in the first set
     rivals: tuple[str, ...]  #: effects whose difference explains as much in its place
     z: float  #: evidence, as a standard normal number
     channels: tuple[str, ...]  #: where it shows, the clearest first
@@ -120,48 +104,6 @@ def compare_with(
     return compare_sets(first, used, last, causes, library, held_out, seed, (*unread, *unfit))
 
 
-class _Sets(NamedTuple):
-    """Evidence of the runs of both sets, with the set and the cluster of each."""
-
-    info: Evidence
-    second: Array  #: (runs,) 1 in the second set
-    cluster: Array  #: (runs,) number of its cluster
-
-    def matrices(self, common: Sequence[str], differ: Sequence[str]) -> tuple[Array, Array]:
-        """Return ``A`` (runs, n, n) and ``g`` (runs, n) of values in common, then of differences."""
-        parts, at = self.info.marginal[0], self.info.places([*common, *differ])
-        factor = np.ones((len(self.second), len(at)))
-        factor[:, len(common) :] = self.second[:, None]
-        return parts[:, at][:, :, at] * factor[:, :, None] * factor[:, None, :], parts[:, at, -1] * factor
-
-    def fit(self, common: Sequence[str], differ: Sequence[str]) -> Array:
-        """Return the values (n,) that fit all runs best."""
-        a, g = self.matrices(common, differ)
-        return np.asarray(np.linalg.pinv(a.sum(axis=0), hermitian=True) @ g.sum(axis=0))
-
-    def loss(self, common: Sequence[str], differ: Sequence[str]) -> float:
-        """Return minus twice the log-likelihood of the best fit, up to a constant."""
-        return float(
-            self.info.c.sum() - self.matrices(common, differ)[1].sum(axis=0) @ self.fit(common, differ)
-        )
-
-
-class _Test(NamedTuple):
-    """Evidence of a difference, with its value (p,), the standard deviation, its degrees of freedom, and the gain."""
-
-    z: float
-    change: Array
-    std: Array
-    dof: float
-    gain: float  #: on clusters left out of the fit
-    dispersion: float
-
-    @property
-    def significant(self) -> bool:
-        """Whether it is above the threshold and gains."""
-        return self.z > Z_EFFECT and self.gain > 0.0
-
-
 def compare_sets(
     first: Sequence[Signals],
     second: Sequence[Signals],
@@ -193,67 +135,77 @@ def compare_sets(
             raise DataError(
                 f"against: the {name} set has {len(runs)} runs that can be compared; {MIN_RUNS} are required"
             )
-    every = (*first, *second)
+    every = [*first, *[replace(run, is_second=True) for run in second]]
     low_pass, alone = low_pass_of([*every, *held_out[0], *held_out[1]]), simulation.vector
     # noise and scatter are those of the first set, to which the simulation was fitted
     before = Problem(tuple(first), simulation, low_pass, tuple(library)).at(alone)
-    about: dict[str, Any] = {"noise": before.noise, "scatter": before.scatter}
-    problem = Problem(every, simulation, low_pass, tuple(library))
-    is_second = np.repeat([0.0, 1.0], [len(first), len(second)])
     n_sessions = tuple([len({run.session for run in runs if run.session}) for runs in (first, second)])
     by_session = min(n_sessions) >= MIN_SESSIONS and all(run.session for run in every)
-    keys = [(i >= len(first), run.session) if by_session else (i, "") for i, run in enumerate(every)]
-    cluster = np.array([sorted(set(keys)).index(key) for key in keys])
-    start = _Sets(problem.at(alone, **about), is_second, cluster)
-
-    def refit(chosen: Sequence[Effect]) -> _Sets:
-        """Return the evidence with sensitivities at the values of each set."""
-        sets, differ = start, names_of(chosen)
-        for _ in range(N_STEPS if chosen else 0):
-            sets = start._replace(
-                info=problem.at(alone, own=_own_values(sets, causes, differ, is_second), **about)
-            )
-        return sets
-
-    chosen: list[Effect] = []
-    sets = start
-    while len(chosen) < MAX_DIFFERENCES:
-        tests = {e: _test(sets, causes, chosen, e) for e in library if e not in chosen}
-        passing = sorted((-test.gain, k) for k, test in enumerate(tests.values()) if test.significant)
-        if not passing:
+    keys = [(run.is_second, run.session) for run in every]
+    session = np.array([sorted(set(keys)).index(key) for key in keys]) if by_session else None
+    given = {"noise": before.noise, "scatter": before.scatter}
+    both = [effect for effect in library if set(names_of([effect])) <= set(causes)]
+    problem = Problem(
+        tuple(every),
+        simulation,
+        low_pass,
+        (*both, *map(difference, library)),
+        given={**given, "session": session},
+        most=len(both) + MAX_DIFFERENCES,
+    )
+    # causes are counted from none of them, the rest from what the simulation has
+    start = np.concatenate([alone, np.zeros_like(alone)])
+    bare = start.copy()
+    bare[[INDEX[name] for name in causes]] = 0.0
+    info = problem.at(start).counted_from(bare)
+    while True:
+        fit = search_on(problem, info, both)
+        beyond = {effect.name for effect in _differences(fit) if not _is_plausible(fit, effect)}
+        if not beyond:
             break
-        close = [[*tests][k] for gain, k in passing[:MAX_FITTED] if -gain > -CLOSE_GAIN * passing[0][0]]
-        fits = [refit([*chosen, effect]) for effect in close]
-        losses = [
-            fit.loss(*_names(causes, [*chosen, effect])) for fit, effect in zip(fits, close, strict=True)
-        ]
-        k = int(np.argmin(losses))
-        more = [*chosen, close[k]]
-        # a difference that another takes the place of is dropped
-        weak = [e for e in more if not _test(fits[k], causes, [o for o in more if o is not e], e).significant]
-        if close[k] in weak:
-            break
-        chosen = [effect for effect in more if effect not in weak]
-        sets = fits[k] if not weak else refit(chosen)
-    reduction, ci, n_held = math.nan, (math.nan, math.nan), len(held_out[0]) + len(held_out[1])
+        problem = problem._replace(barred=problem.barred | beyond)
+
+    # what runs of both that were held out lose without each difference, and without all
+    judged = problem._replace(
+        signals=(*held_out[0], *[replace(run, is_second=True) for run in held_out[1]]), given=given
+    )
+    found, n_held = _differences(fit), len(judged.signals)
+    reduction, ci = math.nan, (math.nan, math.nan)
     candidates: tuple[Difference, ...] = ()
-    if chosen and n_held:
-        about = {"problem": problem, "causes": causes, "held_out": held_out, "seed": seed}
-        earned = []
-        for effect in chosen:
-            others = [other for other in chosen if other is not effect]
-            own, (low, _) = _gain(sets, refit(others), chosen, others, **about)
-            if (low if n_held >= MIN_RUNS else own) > 0.0:  # of two runs Student's t reaches 13 deviations
-                earned.append(effect)
-        weak = [effect for effect in chosen if effect not in earned]
-        candidates = tuple([_difference(sets, causes, chosen, effect, library) for effect in weak])
-        sets, chosen = refit(earned) if weak else sets, earned
-        if chosen:
-            reduction, ci = _gain(sets, start, chosen, (), **about)
+    if found and n_held:
+
+        def gain(fit: CauseFit, out: Sequence[Effect]) -> tuple[float, tuple[float, float]]:
+            """Return the part of the square that differences take from values in common, beside the other causes."""
+            common = [effect for effect in library if effect.name + MORE in [each.name for each in out]]
+            rest = list(dict.fromkeys([*[cause for cause in fit.causes if cause not in out], *common]))
+            costs = [
+                judged.at(move_point(at.vector, names, at.fit(names)[0]), ()).c
+                for at, names in (
+                    (relinearize(problem, fit.info, rest), names_of(rest)),
+                    (fit.info, fit.names),
+                )
+            ]
+            return ratio_of_sums(costs[0] - costs[1], costs[0], seed)
+
+        weak = []
+        for effect in found:
+            own, (low, _) = gain(fit, [effect])
+            if (
+                not (low if n_held >= MIN_RUNS else own) > 0.0
+            ):  # of two runs Student's t reaches 13 deviations
+                weak.append(effect)
+        if weak:
+            candidates = _stated(problem, fit, info, weak)
+            problem = problem._replace(barred=problem.barred | {effect.name for effect in weak})
+            rest = [cause for cause in fit.causes if cause not in weak]
+            fit = refit(problem, fit.info, rest)
+            found = _differences(fit)
+        if found:
+            reduction, ci = gain(fit, found)
     return Against(
-        tuple([_difference(sets, causes, chosen, effect, library) for effect in chosen]),
+        _stated(problem, fit, info, found),
         candidates,
-        _unnamed(sets, causes, chosen),
+        _unnamed(fit, np.array([run.is_second for run in every], dtype=float)),
         (len(first), len(second)),
         (n_sessions[0], n_sessions[1]),
         "sessions" if by_session else "runs",
@@ -264,161 +216,57 @@ def compare_sets(
     )
 
 
-def _names(causes: Sequence[str], chosen: Sequence[Effect]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the parameters that have a value in common, and those that differ."""
-    differ = names_of(chosen)
-    return tuple(dict.fromkeys([*causes, *differ])), differ
+def _differences(fit: CauseFit) -> list[Effect]:
+    """Return the causes of a fit that are differences."""
+    return [cause for cause in fit.causes if cause.name.endswith(MORE)]
 
 
-def _own_values(sets: _Sets, causes: Sequence[str], differ: Sequence[str], second: Array) -> dict[str, Array]:
-    """Return the values (runs,) of each set by parameter, within the bounds."""
-    common = tuple(dict.fromkeys([*causes, *differ]))
-    x = dict(zip([*common, *[f"+{name}" for name in differ]], sets.fit(common, differ).tolist(), strict=True))
-    return {
-        name: np.clip(
-            sets.info.vector[INDEX[name]] + x[name] + x.get(f"+{name}", 0.0) * second, *BOUNDS[name]
-        )
-        for name in common
-    }
+def _first(fit: CauseFit, name: str) -> float:
+    """Return the value of a parameter in the first set."""
+    return float(fit.info.vector[INDEX[name]] + fit.change[fit.names.index(name)])
 
 
-def _test(sets: _Sets, causes: Sequence[str], chosen: Sequence[Effect], effect: Effect) -> _Test:
-    """Return the evidence of a difference beside those chosen; its value in common is fitted with it."""
-    common, differ = _names(causes, [*chosen, effect])
-    own = [p.name for p in effect.parameters]
-    differ = (*[name for name in differ if name not in own], *own)
-    a, g = sets.matrices(common, differ)
-    n = a.shape[1] - len(own)
-    clusters = int(sets.cluster.max()) + 1
-    parts, scores = np.zeros((clusters, *a.shape[1:])), np.zeros((clusters, a.shape[1]))
-    np.add.at(parts, sets.cluster, a)
-    np.add.at(scores, sets.cluster, g)
-    total, score = parts.sum(axis=0), scores.sum(axis=0)
-    nothing = _Test(0.0, np.zeros(len(own)), np.full(len(own), math.inf), 1.0, 0.0, 1.0)
-    if not np.diag(total)[n:].min() > 1e-12:
-        return nothing
-    follow, free = partial_information(total, range(n), range(n, n + len(own)))
-    if not np.linalg.eigvalsh(free)[0] > 1e-9 * np.diag(total)[n:].min():
-        return nothing
-    cov = np.linalg.inv(free)
-    change = cov @ (score[n:] - follow.T @ score[:n])
-    size = float(change @ free @ change)
-    if not size > 0.0:
-        return nothing
-    x = np.linalg.pinv(total, hermitian=True) @ score
-    direction = np.concatenate([-follow @ change, change])
-    dispersion, dof = clustered_variance(parts, scores, x, direction, size)
-    dispersion = max(dispersion, 1.0) if clusters > 2 else dispersion
-    root = math.sqrt(size) if len(own) == 1 else z_of(float(chi2.logsf(min(size, 1400.0), len(own))))
-    z = z_of_t(root / math.sqrt(dispersion), max(dof, TRUST_DOF if clusters < 2 else dof))
-    gains = []
-    for k in range(clusters):
-        rest, right = total - parts[k], score - scores[k]
-        fits = []
-        for m in (n, n + len(own)):
-            there = np.linalg.pinv(rest[:m, :m], hermitian=True, rcond=1e-12) @ right[:m]
-            fits.append(float(there @ parts[k][:m, :m] @ there - 2.0 * there @ scores[k][:m]))
-        gains.append(fits[0] - fits[1])
-    std = np.sqrt(np.maximum(np.diag(cov), 0.0) * dispersion)
-    # in neither set is it of a size that no builder would believe
-    for p, more in zip(effect.parameters, change.tolist(), strict=True):
-        first = float(sets.info.vector[INDEX[p.name]] + x[common.index(p.name)])
-        if not all(p.plausible[0] <= value <= p.plausible[1] for value in (first, first + more)):
-            return nothing
-    return _Test(z, change, std, dof, float(np.sum(gains)), dispersion)
-
-
-def _difference(
-    sets: _Sets, causes: Sequence[str], chosen: Sequence[Effect], effect: Effect, library: Sequence[Effect]
-) -> Difference:
-    """Return a difference with its intervals, and what explains as much in its place."""
-    others = [other for other in chosen if other is not effect]
-    test = _test(sets, causes, others, effect)
-    half = float(student.ppf(0.975, test.dof)) * test.std
-    numbers = zip(effect.parameters, test.change.tolist(), half.tolist(), strict=True)
-    values = tuple([Value(p.name, x, p.unit, x - h, x + h) for p, x, h in numbers])
-    common, differ = _names(causes, chosen)
-    x, a = sets.fit(common, differ), sets.matrices(common, differ)[0].sum(axis=0)
-    std = np.sqrt(np.maximum(np.diag(np.linalg.pinv(a, hermitian=True)), 0.0) * max(test.dispersion, 1.0))
-    first = []
+def _is_plausible(fit: CauseFit, effect: Effect) -> bool:
+    """Return whether a difference is between values of a size that a builder would believe."""
     for p in effect.parameters:
-        at = common.index(p.name)
-        value, h = float(x[at]), float(student.ppf(0.975, test.dof) * std[at])
-        first.append(Value(p.name, value, p.unit, value - h, value + h))
-    # in its place: its own value in common stays, so that only the difference is asked for
-    own, rivals = [p.name for p in effect.parameters], []
-    for other in library:
-        if other in chosen:
-            continue
-        swapped = names_of([*others, other])
-        with_it = tuple(dict.fromkeys([*common, *names_of([other])]))
-        behind = sets.loss(with_it, swapped) - sets.loss(with_it, differ)
-        if (
-            behind < RIVAL_LOSS * max(test.dispersion, 1.0)
-            and _test(sets, [*causes, *own], others, other).significant
-        ):
-            rivals.append((behind, other.name))
-    weights = np.zeros((1, len(sets.info.names)))
-    weights[0, sets.info.places(own)] = test.change
-    power = sets.info.channel_power(weights)
-    order = np.argsort(-power)
-    shown = tuple([CHANNELS[i] for i in order if power[i] > 0.1 * power[order[0]]])
-    return Difference(
-        effect.name, values, tuple(first), tuple([name for _, name in sorted(rivals)]), test.z, shown
-    )
+        first, (low, high) = _first(fit, in_common(p.name)), PARAMETER[in_common(p.name)].plausible
+        if not all(low <= value <= high for value in (first, first + _first(fit, p.name))):
+            return False
+    return True
 
 
-def _unnamed(sets: _Sets, causes: Sequence[str], chosen: Sequence[Effect]) -> tuple[Unexplained, ...]:
-    """Return the channels whose residual depends on an input otherwise in one set than in the other."""
-    common, differ = _names(causes, chosen)
-    x = sets.fit(common, differ)
-    base = dict(zip(common, x[: len(common)].tolist(), strict=True))
-    more = dict(zip(differ, x[len(common) :].tolist(), strict=True))
-    left = []
-    for white, second in zip(sets.info.white, sets.second, strict=True):
-        change = np.zeros(len(sets.info.names))
-        for name, value in base.items():
-            change[sets.info.names.index(name)] = value + more.get(name, 0.0) * second
-        left.append(
-            np.concatenate([white[:-1], (white[-1] - np.tensordot(change, white[:-1], axes=1))[None]])
+def _stated(
+    problem: Problem, fit: CauseFit, start: Evidence, effects: Sequence[Effect]
+) -> tuple[Difference, ...]:
+    """Return differences with their intervals, and what explains as much in their place."""
+    stated, fit = [], fit._replace(rivals=rivals_of(problem, fit.info, start, fit.causes, effects))
+    for effect in effects:
+        values = tuple(
+            [v._replace(name=in_common(v.name), unit=in_common(v.unit)) for v in values_of(fit, effect)]
         )
-    info = replace(sets.info, white=tuple(left))
+        first = []
+        for p in effect.parameters:
+            at = fit.names.index(in_common(p.name))
+            half = INTERVAL_T * math.sqrt(float(fit.cov[at, at]) * fit.tests[effect.name].inflation)
+            value = _first(fit, in_common(p.name))
+            first.append(Value(in_common(p.name), value, in_common(p.unit), value - half, value + half))
+        rivals = tuple([in_common(name) for name in fit.rivals[effect.name]])
+        about = fit.tests[effect.name].z, shown_channels(fit, effect)
+        stated.append(Difference(in_common(effect.name), values, tuple(first), rivals, *about))
+    return tuple(stated)
+
+
+def _unnamed(fit: CauseFit, second: Array) -> tuple[Unexplained, ...]:
+    """Return the channels whose residual depends on an input otherwise in one set than in the other."""
+    info = fit.info.counted_from(move_point(fit.info.vector, fit.names, fit.change))
     best: dict[str, Unexplained] = {}
     for c, channel in enumerate(CHANNELS):
-        power = sum([float((white[-1, :, c] ** 2).sum()) for white in left])
+        power = sum([float((white[-1, :, c] ** 2).sum()) for white in info.white])
         for name, (value, size) in input_values(info, c).items() if power > 0.0 else ():
             variance = np.where(size > 0.0, 1.0 / np.where(size > 0.0, size, 1.0), np.inf)
-            z = evidence_of_parts(value, variance, sets.second > 0)
+            z = evidence_of_parts(value, variance, second > 0)
             if z > Z_PROBE and (channel not in best or z > best[channel].z):
-                means = [np.average(value, weights=size * of) for of in (sets.second, 1.0 - sets.second)]
-                gain = (means[0] - means[1]) ** 2 * float(size @ sets.second)
+                means = [np.average(value, weights=size * of) for of in (second, 1.0 - second)]
+                gain = (means[0] - means[1]) ** 2 * float(size @ second)
                 best[channel] = Unexplained(channel, name, z, min(gain / power, 1.0))
     return tuple(sorted(best.values(), key=lambda each: -each.z))
-
-
-def _gain(
-    sets: _Sets,
-    start: _Sets,
-    chosen: Sequence[Effect],
-    others: Sequence[Effect],
-    problem: Problem,
-    causes: Sequence[str],
-    held_out: tuple[Sequence[Signals], Sequence[Signals]],
-    seed: int,
-) -> tuple[float, tuple[float, float]]:
-    """Return by how much the square of held-out runs falls where each set has its own values, and its interval.
-
-    It falls from that of the fit ``start``, in which those of ``others`` alone differ.
-    """
-    common, differ = _names(causes, chosen)
-    second = np.repeat([0.0, 1.0], [len(runs) for runs in held_out])
-    judged = problem._replace(signals=(*held_out[0], *held_out[1]))
-    costs = []
-    for of, names in ((start, names_of(others)), (sets, differ)):
-        own: Mapping[str, Array] = _own_values(of, common, names, second)
-        info = judged.at(sets.info.vector, noise=sets.info.noise, scatter=sets.info.scatter, own=own)
-        there = np.column_stack([values - sets.info.vector[INDEX[name]] for name, values in own.items()])
-        at = info.places([*own])
-        a, g = info.clusters(at)
-        costs.append(info.c + np.einsum("ri,rij,rj->r", there, a, there) - 2.0 * (there * g).sum(axis=1))
-    return ratio_of_sums(costs[0] - costs[1], costs[0], seed)

@@ -379,8 +379,9 @@ def varying_effects(problem: Problem, fit: CauseFit) -> tuple[verdict.Varying, .
                 runs.name: np.clip(info.vector[INDEX[runs.name]] + runs.value, *BOUNDS[runs.name])
                 for runs in own.runs
             }
-            there = problem.at(info.origin, info.names, noise=info.noise, scatter=info.scatter, own=at)
-            own = _own_values(there.counted_from(info.vector), own, known, columns)
+            there = problem.at(info.origin, [*at], noise=info.noise, scatter={}, own=at)
+            there = info.counted_from(info.origin).with_columns(there).counted_from(info.vector)
+            own = _own_values(there, own, known, columns)
         own = own._replace(runs=[runs.in_pattern(problem.signals) for runs in own.runs])
         of = own.clearest
         (low, high), seen = BOUNDS[of.name], of.weight > 0

@@ -24,9 +24,10 @@ from scipy.special import ndtri, stdtr
 from scipy.stats import chi2
 
 from terrain.bootstrap import bootstrap_counts, percentile_interval
+from terrain.discrepancy.differences import BOUNDS, INDEX, in_common
 from terrain.discrepancy.noise import ORDER, ORDERS, WHITE, Noise, noise_of, whiten
 from terrain.discrepancy.runs import LowPass, Rows, Signals, Simulation, rows_of
-from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect
+from terrain.effects import CHANNELS, Effect
 from terrain.records import Array
 
 N_BLOCKS = 3  #: Time blocks of a run; they serve as clusters where runs are few
@@ -70,7 +71,7 @@ class Evidence:
     """Evidence of runs around one point of the parameters."""
 
     names: tuple[str, ...]  #: of the k parameters
-    vector: Array  #: (len(PARAMETERS),) the point from which changes are counted
+    vector: Array  #: (len(PARAMETERS),), of two sets twice that, the point from which changes are counted
     origin: Array  #: the point where sensitivities were taken, whatever changes are counted from
     grams: Array
     """(runs, N_BLOCKS, k + 1, k + 1) products of whitened sensitivities and, last, of the residual, in each third
@@ -80,6 +81,9 @@ class Evidence:
     noise: Noise
     white: tuple[Array, ...]  #: of each run (k + 1, rows, channels) the columns, 0 where nothing was measured
     model_std: Array  #: (k,) error of the simulation itself in units of each parameter, the same in all runs
+    session: Array | None = (
+        None  #: (runs,) number of the session where these are the clusters, in place of runs
+    )
 
     def places(self, names: Sequence[str]) -> list[int]:
         """Return the positions of parameters in the matrices."""
@@ -133,9 +137,21 @@ class Evidence:
         white = [np.concatenate([run[:-1], r[None]]) for run, r in zip(self.white, left, strict=True)]
         return replace(self, vector=vector, grams=columns.T @ self.grams @ columns, white=tuple(white))
 
+    def with_columns(self, other: Evidence) -> Evidence:
+        """Return the same with the columns and the residual of other evidence on some of the parameters."""
+        at, white = [*self.places(other.names), len(self.names)], [run.copy() for run in self.white]
+        for run, columns in zip(white, other.white, strict=True):
+            run[at] = columns
+        return replace(self, grams=np.array([grams_of(run) for run in white]), white=tuple(white))
+
     def clusters(self, at: Sequence[int], by_run: bool = True) -> tuple[Array, Array]:
-        """Return ``A`` (clusters, n, n) and ``g`` (clusters, n) of some places, a cluster a run or a third of one."""
+        """Return ``A`` (clusters, n, n) and ``g`` (clusters, n) of some places.
+
+        A cluster is a run, its session where that is known, or a third of a run.
+        """
         parts = self.marginal[0]
+        if by_run and self.session is not None:
+            parts = np.tensordot(np.eye(int(self.session.max()) + 1)[:, self.session], parts, axes=1)
         if not by_run:
             parts = marginal_parts(self.grams, self.nuisances, self.nuisance_std)
             parts = parts.reshape(-1, *parts.shape[2:])
@@ -190,6 +206,7 @@ def evidence_at(
     noise: Noise | None = None,
     scatter: Mapping[str, float] | None = None,
     own: Mapping[str, Array] | None = None,
+    session: Array | None = None,
 ) -> Evidence:
     """Return the evidence of runs around a point; noise and scatter are estimated unless the noise is given.
 
@@ -213,7 +230,7 @@ def evidence_at(
     def whitened(noise: Noise, scatter: Mapping[str, float]) -> Evidence:
         white = tuple([whiten_run(noise, run) for run in rows])
         grams = np.array([grams_of(columns) for columns in white])
-        return Evidence(names, vector, vector, grams, scatter, tuple(rows), noise, white, model_std)
+        return Evidence(names, vector, vector, grams, scatter, tuple(rows), noise, white, model_std, session)
 
     if noise is not None:
         return whitened(noise, assumed)
@@ -364,7 +381,8 @@ def wald_test(info: Evidence, selected: Sequence[str], effect: Effect) -> WaldTe
     weighted by their degrees of freedom.
     """
     own = [p.name for p in effect.parameters]
-    base = info.places([name for name in selected if name not in own])
+    beside = dict.fromkeys([*selected, *map(in_common, own)])
+    base = info.places([name for name in beside if name not in own])
     both, n = base + info.places(own), len(base)
     a, g = info.clusters(both)
     total, score = a.sum(axis=0), g.sum(axis=0)
@@ -383,7 +401,8 @@ def wald_test(info: Evidence, selected: Sequence[str], effect: Effect) -> WaldTe
         x = np.concatenate([np.zeros(n), change])
         if n:
             x[:n] = np.linalg.lstsq(total[:n, :n], score[:n] - total[:n, n:] @ change, rcond=1e-10)[0]
-        parts = (a, g) if len(a) >= MIN_CLUSTERS else info.clusters(both, by_run=False)
+        few = len(a) < MIN_CLUSTERS and info.session is None
+        parts = info.clusters(both, by_run=False) if few else (a, g)
         dispersion, dof = clustered_variance(*parts, x, np.concatenate([-follow @ change, change]), size)
         dispersion += float((((free @ change) * info.model_std[both[n:]]) ** 2).sum()) / size
     root = math.sqrt(statistic := float(own_score @ change))

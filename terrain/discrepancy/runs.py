@@ -21,6 +21,7 @@ from scipy.ndimage import median_filter
 
 from terrain.angles import unwrapped, wrapped
 from terrain.constants import GRAVITY_MPS2
+from terrain.discrepancy.differences import in_common, in_set
 from terrain.effects import (
     ACCEL,
     CHANNELS,
@@ -29,6 +30,7 @@ from terrain.effects import (
     HEADING,
     INDEX,
     ONE_SIDED,
+    PARAMETERS,
     SENSED_ONLY,
     SHOWS,
     SPEED_X,
@@ -196,6 +198,7 @@ class Signals:
     place: float = math.nan  #: in the order in which runs were driven, from 0; NaN: as they are given
     #: (n, len(IMU_AXES)) all axes of the IMU, which tell exchanged axes; (n, 0) where they are not logged
     axes: Array = field(default_factory=partial(np.empty, (0, 0)))
+    is_second: bool = False  #: of two sets that are compared
 
     def __len__(self) -> int:
         return len(self.measured)
@@ -586,6 +589,12 @@ def rows_of(
     low-pass filtered wheel speeds, as instruments: the noise of a differentiated encoder grows with
     frequency, the commands do not.
     """
+    if len(vector) > len(PARAMETERS):  # of two sets
+        names = tuple(dict.fromkeys(map(in_common, parameters)))
+        rows = rows_of(signals, planar, in_set(vector, signals.is_second), names, low_pass)
+        acts = [name in names or signals.is_second for name in parameters]
+        sensitivity = rows.sensitivity[[names.index(in_common(name)) for name in parameters]]
+        return rows._replace(sensitivity=sensitivity * np.reshape(acts, (-1, 1, 1)))
     dt, wheel_speed, steer, grade, roll, measured = prepare_inputs(signals, low_pass)
     n_rows, kept = _kept_rows(dt, wheel_speed, steer, low_pass)
     known = np.isfinite(measured)

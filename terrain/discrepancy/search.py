@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from terrain.discrepancy.differences import BOUNDS, INDEX, PARAMETER, in_common
 from terrain.discrepancy.evidence import (
     Evidence,
     WaldTest,
@@ -21,7 +22,7 @@ from terrain.discrepancy.evidence import (
     whiten_run,
 )
 from terrain.discrepancy.runs import LowPass, Signals, Simulation, rows_of
-from terrain.effects import BOUNDS, INDEX, PARAMETER, PARAMETERS, Effect
+from terrain.effects import Effect
 from terrain.records import Array
 
 # -- A problem: runs and a simulation; and nonlinear fits of parameters to all of them ---------------------
@@ -40,6 +41,11 @@ ends them."""
 RIVAL_REFITS = 3  #: Most relinearisations of a rival
 
 
+MAX_CAUSES = 8
+"""Most causes of a diagnosis: with more the simulation is of another robot.  Lags of two sensors, track, side
+slip, drag, and a wrong lever arm are six."""
+
+
 class Problem(NamedTuple):
     """Runs, the simulation, the low-pass of all, and the effects that may be named."""
 
@@ -50,6 +56,8 @@ class Problem(NamedTuple):
     varying: Mapping[str, float] = MappingProxyType({})
     """Scatter by parameter, beside that of the simulation."""
     barred: frozenset[str] = frozenset()  #: names of effects of the library that are no causes
+    most: int = MAX_CAUSES  #: causes
+    given: Mapping[str, Any] = MappingProxyType({})  #: of the evidence, in place of what would be estimated
 
     @property
     def candidates(self) -> tuple[Effect, ...]:
@@ -63,7 +71,10 @@ class Problem(NamedTuple):
 
     def at(self, vector: Array, names: Sequence[str] | None = None, **about: Any) -> Evidence:
         """Return the evidence of the runs around a point, on the library by default; see :func:`evidence_at`."""
-        names, about = names_of(self.library) if names is None else names, {"scatter": self.scatter, **about}
+        names, about = (
+            names_of(self.library) if names is None else names,
+            {"scatter": self.scatter, **self.given, **about},
+        )
         return evidence_at(self.signals, self.simulation, vector, names, self.low_pass, **about)
 
     def near(self, info: Evidence, vector: Array, names: Sequence[str]) -> Evidence:
@@ -102,7 +113,7 @@ def misfit_of(info: Evidence, there: Evidence) -> float:
 
 
 def names_of(effects: Sequence[Effect]) -> tuple[str, ...]:
-    """Return the parameters of effects, each once.
+    """Return the parameters of effects, each once, that of both sets before a difference of it.
 
     Examples
     --------
@@ -110,7 +121,8 @@ def names_of(effects: Sequence[Effect]) -> tuple[str, ...]:
     >>> names_of([effect_named("lever_arm")])
     ('lever_x_m', 'lever_y_m')
     """
-    return tuple(dict.fromkeys([p.name for effect in effects for p in effect.parameters]))
+    names = [p.name for effect in effects for p in effect.parameters]
+    return tuple(dict.fromkeys([each for name in names for each in (in_common(name), name)]))
 
 
 def steps_of(problem: Problem, info: Evidence, names: Sequence[str], n_most: int) -> Iterator[Evidence]:
@@ -214,9 +226,13 @@ Rivals = Mapping[str, Rival]
 
 
 def rivals_of(
-    problem: Problem, info: Evidence, start: Evidence, causes: Sequence[Effect]
+    problem: Problem,
+    info: Evidence,
+    start: Evidence,
+    causes: Sequence[Effect],
+    some: Sequence[Effect] | None = None,
 ) -> Mapping[str, Rivals]:
-    """Return by cause all effects that, refitted in its place, fit as well as it does.
+    """Return by cause (of ``some``, all by default) the effects that, refitted in its place, fit as well as it does.
 
     It is compared by the noise that the causes leave and by that of the simulation as it is given: a cause
     that absorbs noise is ahead by only one of them.  Where runs disagree on a cause by more than the noise
@@ -227,7 +243,7 @@ def rivals_of(
     runs_alone = replace(info, model_std=np.zeros_like(info.model_std))  # in what all runs have they agree
     own: list[tuple[float, Evidence]] = []  # the causes by both judges, where anything comes near
     rivals = {}
-    for cause in causes:
+    for cause in causes if some is None else some:
         others = [other for other in causes if other is not cause]
         inflation = wald_test(runs_alone, names_of(others), cause).inflation
         as_good = []
@@ -245,7 +261,7 @@ def rivals_of(
                 std = np.sqrt(np.maximum(np.diag(here.fit(swapped)[1]), 0.0))[places]
                 ends = here.vector[at] + np.outer((-PLAUSIBLE_STDS, PLAUSIBLE_STDS), std)
                 if all(p.is_plausible(*own) for p, own in zip(effect.parameters, ends.T, strict=True)):
-                    moved = dict(zip(PARAMETERS, (here.vector - info.vector).tolist(), strict=True))
+                    moved = dict(zip(INDEX, (here.vector - info.vector).tolist(), strict=False))
                     beside = {name: moved[name] for name in names_of(others)}
                     less = surprise(own[0][1].vector, names_of(causes)) - surprise(here.vector, swapped)
                     rival = Rival(here.vector[at] - info.vector[at], std, beside, behind - less)
@@ -265,7 +281,8 @@ def _near(
     for effect in problem.library:
         if effect is cause or effect in others or info.loss(names_of([*others, effect])) - now >= most:
             continue
-        base, own, its = [info.places(names) for names in (beside, names_of([cause]), names_of([effect]))]
+        own, its = [info.places([p.name for p in each.parameters]) for each in (cause, effect)]
+        base = [at for at in info.places(names_of([*others, cause, effect])) if at not in (*own, *its)]
         free = partial_information(info.a.sum(axis=0), base, [*own, *its])[1]
         alike = correlation(free, range(len(own)), range(len(own), len(free)))
         if alike > SHARED and wald_test(info, beside, effect).inside:
@@ -273,10 +290,6 @@ def _near(
 
 
 # -- The search: greedy addition, refit, drop and swap ---------------------------------------------------------
-
-MAX_CAUSES = 8
-"""Most causes of a diagnosis: with more the simulation is of another robot.  Lags of two sensors, track, side
-slip, drag, and a wrong lever arm are six."""
 
 MAX_STEPS = 12  #: Most steps of the search, successful or not
 
@@ -387,7 +400,7 @@ def _add_causes(problem: Problem, info: Evidence, causes: list[Effect]) -> tuple
         new = [effect for _, effect in candidates[:1]] or _pair(info, names, left)
         if len(close) > 1 and candidates[0][0] >= MUCH_GAIN:
             new = [min(close, key=lambda effect: fit(effect)[0])]
-        if not new or len(causes) + len(new) > MAX_CAUSES:
+        if not new or len(causes) + len(new) > problem.most:
             break
         more, at = _refit_significant(problem, info, [*causes, *new], seen)
         if at is not info:
@@ -484,7 +497,8 @@ def _pair(info: Evidence, names: Sequence[str], library: Sequence[Effect]) -> li
     Two of opposite sign, as an offset and a rate of a clock, hide each other.
     """
     left = [effect for effect in library if len(effect.parameters) == 1]
-    base, own = info.places(names), info.places(names_of(left))
+    own = info.places([effect.parameters[0].name for effect in left])
+    base = [at for at in info.places(list(dict.fromkeys([*names, *names_of(left)]))) if at not in own]
     a, g = info.a.sum(axis=0), info.g.sum(axis=0)
     follow, a_free = partial_information(a, base, own)
     g_free = g[own] - g[base] @ follow

@@ -9,8 +9,8 @@ from studies.blind_trials.trial import simulation_of
 from pipelines.explain.against import against_parts, against_text
 from terrain.discrepancy.against import compare_sets, compare_with
 from terrain.discrepancy.diagnosed_runs import diagnose_runs
-from terrain.discrepancy.runs import signals_of
-from terrain.effects import effect_named
+from terrain.discrepancy.runs import low_pass_of, rows_of, signals_of
+from terrain.effects import effect_named, vector_of
 from terrain.errors import DataError
 from terrain.robots import load_robot
 
@@ -72,6 +72,34 @@ def test_a_difference_that_held_out_runs_do_not_have_is_a_candidate(sets):
         assert (named, not_earned) == ((["wheel_radius"], []) if changed else ([], ["wheel_radius"]))
         assert ("not stated: wheel radius" in against_text(against, "b")) == (not changed)
         assert (against.reduction > 0.0) == bool(changed)
+
+
+def test_two_changes_are_named_where_runs_that_are_held_out_have_both(sets):
+    change = {"wheel_radius_ratio": -0.05, "gyro_scale_ratio": 0.04}
+    first, second = sets({}, change)
+    against = compare_sets(first, second, simulation_of(HUSKY), (), LIBRARY, sets({}, change, seed=7))
+    sizes = {each.name: each.parameters[0].value for each in against.differences}
+    assert sizes == pytest.approx({"wheel_radius": -0.05, "gyro_scale": 0.04}, rel=0.2)
+    assert (against.candidates, against.ci[0] > 0.0) == ((), True)
+
+
+def test_a_change_to_a_size_that_no_builder_would_believe_is_not_named(sets):
+    first, second = sets({"wheel_radius_ratio": 0.08}, {"wheel_radius_ratio": -0.16})
+    against = compare_sets(first, second, simulation_of(HUSKY), ("wheel_radius_ratio",), LIBRARY)
+    assert "wheel_radius" not in [each.name for each in against.differences]
+
+
+def test_a_difference_acts_in_the_second_set_alone_as_its_parameter_does(sets):
+    (first, *_), (second, *_) = sets({}, {})
+    low_pass, planar = low_pass_of([first, second]), simulation_of(HUSKY).planar_on("")
+    plain, names = vector_of({"wheel_radius_ratio": 0.02}), ("wheel_radius_ratio", "wheel_radius_ratio+")
+    both = np.concatenate([plain, vector_of({"wheel_radius_ratio": 0.05})])
+    for run, radius, acts in ((first, 0.02, 0.0), (replace(second, is_second=True), 0.07, 1.0)):
+        rows = rows_of(run, planar, both, names, low_pass)
+        alone = rows_of(run, planar, vector_of({"wheel_radius_ratio": radius}), names[:1], low_pass)
+        np.testing.assert_array_equal(rows.predicted, alone.predicted)
+        np.testing.assert_array_equal(rows.sensitivity[0], alone.sensitivity[0])
+        np.testing.assert_array_equal(rows.sensitivity[1], acts * alone.sensitivity[0])
 
 
 def test_a_change_without_a_name_is_left_to_a_channel(sets):
