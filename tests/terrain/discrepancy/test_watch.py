@@ -13,6 +13,7 @@ from terrain.discrepancy.watch import (
     OVERSHOOT,
     REFERENCE,
     Block,
+    BlockDeviation,
     Status,
     Watch,
     Watched,
@@ -133,6 +134,22 @@ def test_an_alarm_is_held_until_the_departure_is_over(hide, watched):
         assert alarm.run_id in [run.run_id for run in changed]
         assert np.isfinite(alarm.over_s)
     assert not watch.current
+
+
+def test_an_alarm_ends_as_soon_after_an_hour_as_after_a_minute():
+    of = "speed_x_mps", "along"
+    each = BlockDeviation(0.0, 1.0, 0.0, 1.0, 1.0, 0.25, 0.0, 50)
+    quiet, changed = ({of: (figure, 1.0, 1.0)} for figure in (0.0, 5.0))
+    over_s = []
+    for n in (20, 1200):
+        watch = Watch(Watched(HUSKY, 20.0, {of: each}, ""))
+        for k in range(n + 40):
+            watch.take(Block(BLOCK_S * k, Status.AGREES, figures=changed if k < n else quiet))
+        (alarm,) = watch.alarms
+        assert alarm.since_s == 0.0
+        assert alarm.size == pytest.approx(5.0)
+        over_s.append(alarm.over_s - BLOCK_S * n)
+    assert over_s[0] == over_s[1] < 100.0
 
 
 @pytest.fixture(scope="module")
