@@ -41,14 +41,14 @@ class Settings(BaseSettings):
     seed: int = setting(0, "Of the split and of the draws.", ge=0)
 
 
-def scaled(stream: str, start: str, factor: float) -> Callable[[RunLog], RunLog]:
-    """Return what multiplies the channels of a stream whose names begin so."""
+def scaled(stream: str, starts: tuple[str, ...], factor: float) -> Callable[[RunLog], RunLog]:
+    """Return what multiplies the channels of a stream whose names begin with one of some."""
 
     def change(run: RunLog) -> RunLog:
         if stream not in run.streams:
             return run
         old = run.streams[stream]
-        factors = [factor if name.startswith(start) else 1.0 for name in old.channels]
+        factors = [factor if name.startswith(starts) else 1.0 for name in old.channels]
         return replace(
             run, streams={**run.streams, stream: Stream(old.time_s, old.values * factors, old.channels)}
         )
@@ -57,19 +57,25 @@ def scaled(stream: str, start: str, factor: float) -> Callable[[RunLog], RunLog]
 
 
 def _turning_less(run: RunLog) -> RunLog:
-    return scaled("lidar", "yaw_rate", 0.7)(scaled("imu", "gyro_z", 0.7)(run))
+    return scaled("lidar", ("yaw_rate",), 0.7)(scaled("imu", ("gyro_z",), 0.7)(run))
 
 
 CHANGES: Mapping[str, Callable[[RunLog], RunLog]] = {
     "none": lambda run: run,
-    "wheel radius -10 %": scaled("wheels", "speed_", 1 / 0.9),
-    "wheel radius -20 %": scaled("wheels", "speed_", 1 / 0.8),
-    "gyro +10 %": scaled("imu", "gyro_z", 1.1),
-    "gyro +20 %": scaled("imu", "gyro_z", 1.2),
+    "wheel radius -10 %": scaled("wheels", ("speed_", "motor_"), 1 / 0.9),
+    "wheel radius -20 %": scaled("wheels", ("speed_", "motor_"), 1 / 0.8),
+    "gyro +10 %": scaled("imu", ("gyro_z",), 1.1),
+    "gyro +20 %": scaled("imu", ("gyro_z",), 1.2),
     "turns 30 % less": _turning_less,
-    "currents +30 %": scaled("wheels", "current_", 1.3),
+    "currents +30 %": scaled("wheels", ("current_",), 1.3),
 }
 """Changes that are written into logs; one that changes nothing of a set is left out."""
+
+
+def _changes(changed: RunLog, run: RunLog) -> bool:
+    """Return whether a change is one of a run."""
+    pairs = [(stream.values, run.streams[name].values) for name, stream in changed.streams.items()]
+    return not all(np.array_equal(new, old, equal_nan=True) for new, old in pairs)
 
 
 class WatchedRuns(NamedTuple):
@@ -156,12 +162,8 @@ def run(settings: Settings, progress: Progress = silent) -> Watching:
     groups: dict[str, list[RunLog]] = {}
     for run in held_out:
         groups.setdefault(run.session or "held out", []).append(run)
-    wheels = held_out[0].streams["wheels"].channels
     changes = [
-        name
-        for name in CHANGES
-        if (name != "currents +30 %" or any(each.startswith("current_") for each in wheels))
-        and (not name.startswith("gyro") or "imu" in held_out[0].streams)
+        name for name in CHANGES if name == "none" or _changes(CHANGES[name](held_out[0]), held_out[0])
     ]
     rows = []
     for name, own in groups.items():
