@@ -69,7 +69,7 @@ ENTANGLED = 0.97
 """Correlation of fitted values above which two causes are ambiguous: a collinearity index of 6."""
 
 LITTLE_LEFT = 0.05
-"""Part of the square of a channel that depends on an input, or that the black-box learner removes at the lower end of
+"""Part of the square of a channel that a withdrawn cause makes, or that the black-box learner removes at the lower end of
 its interval, before something is unexplained: less would not change what the simulation is good for."""
 
 POWER_Z = 1.28  #: Added to the threshold, so that nine in ten are detected
@@ -270,8 +270,6 @@ def statement_of(found: Found, judgement: Judgement) -> verdict.Diagnosis:
     for (channel, name), probe in _probes(problem, fit).items():
         if probe.significant and (channel not in best or probe.z > best[channel].z):
             ratio = min(probe.gain / float(power[CHANNELS.index(channel)]), 1.0)
-            if ratio < LITTLE_LEFT:
-                continue
             best[channel] = verdict.Unexplained(channel, name, probe.z, ratio)
     for out in withdrawn.values():
         # where it shows most while the causes are fitted with it: a wheel radius beside an effective track shows in
