@@ -69,8 +69,8 @@ ENTANGLED = 0.97
 """Correlation of fitted values above which two causes are ambiguous: a collinearity index of 6."""
 
 LITTLE_LEFT = 0.05
-"""Part of the square of a channel that a withdrawn cause makes, or that the black-box learner removes at the lower end of
-its interval, before something is unexplained: less would not change what the simulation is good for."""
+"""Part of the square of a channel that a withdrawn cause makes, or that the black-box learner removes at the lower end
+of its interval, before something is unexplained: less would not change what the simulation is good for."""
 
 POWER_Z = 1.28  #: Added to the threshold, so that nine in ten are detected
 

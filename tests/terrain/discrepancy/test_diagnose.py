@@ -212,6 +212,19 @@ def test_an_effect_of_no_library_or_without_its_entry_is_unexplained(worlds):
     assert len(withdrawn.parameters) == 1
 
 
+@pytest.mark.slow
+def test_what_a_withdrawn_cause_makes_is_unexplained_if_it_is_a_part_of_its_channel(worlds, monkeypatch):
+    """A gyro that reads a quarter more than its range is plausible is no gyro scale, and most of its channel."""
+    world = worlds("husky")
+    monkeypatch.setattr(diagnose_module, "_probes", lambda *_: {})
+    runs = world.runs({"gyro_scale_ratio": 0.13})
+    stated = diagnose(runs, world.simulation)
+    assert [left.input for left in stated.unexplained if left.channel == GYRO] == ["gyro_scale"]
+    assert stated.unexplained[0].residual_ratio > 0.5
+    monkeypatch.setattr(diagnose_module, "LITTLE_LEFT", 1.1)
+    assert not diagnose(runs, world.simulation).unexplained
+
+
 def test_exact_twins_are_ambiguous_and_the_channel_that_distinguishes_them_is_named(worlds):
     """Without camera, heading and currents a gyro's scale and an effective track are one and the same."""
     world = worlds("husky")
