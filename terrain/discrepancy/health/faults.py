@@ -19,6 +19,7 @@ from terrain.discrepancy.health.agreement import Agreement, agreement_of, on_own
 from terrain.discrepancy.health.fault import (
     KINDS,
     Change,
+    Column,
     Fault,
     FaultKind,
     FaultStatus,
@@ -34,6 +35,7 @@ from terrain.robots import Robot
 
 #: Signs and exchanges that are searched one after the other; logs with more are no logs of this robot.
 MAX_FAULTS = 4
+LOST = (FaultKind.DROPOUT, FaultKind.SATURATION)  #: Kinds of which samples are left out
 SAME_END = 0.01  #: Relative difference of the two ends of a sensor's range.
 
 
@@ -97,7 +99,9 @@ def faults_of(
         repair(fault)
     for fault in offset_faults(responses(), sessions, robot):
         repair(fault)
-    for fault in scale_faults(responses(), sessions, robot):
+    lost = {fault.change.column for fault in faults if fault.change.kind in LOST}
+    # what is left of a gyro at the end of its range are its small rates, in part
+    for fault in () if lost & {Column.GYRO, Column.HEADING} else scale_faults(responses(), sessions, robot):
         repair(fault)
     return (*faults, *drift_faults(responses(), sessions, robot))
 

@@ -32,6 +32,8 @@ from terrain.records import Array
 from terrain.robots import Robot
 
 SAME_RATIO = 0.25  #: Offsets of two halves of the runs differ by less, relative.
+#: An offset is that of all runs if so many of those that measure its column show it.
+MIN_SHOWN_RATIO = 1 / 3
 MIN_BESIDE = 5  #: Samples of a run in which its witness is known, at the least.
 MIN_SHOWN = 6  #: Runs that show a scale, at the least.
 WITNESS = {G: H, H: G}  #: Channel that measures the same motion: what it has too is no offset of a sensor.
@@ -57,6 +59,8 @@ def offset_faults(runs: Sequence[Rows], sessions: Sequence[str], robot: Robot) -
         against = ~far & (OFFSET_SIGMAS * std < largest)
         has = faulty_runs(sessions, np.where(far, 1, np.where(against, -1, 0)))
         shown = [i for i in has if far[i]]
+        if len(shown) < MIN_SHOWN_RATIO * sum(np.isfinite(runs[i].measured[:, c]).any() for i in has):
+            continue  # a run or two of many are of a body that slides
         parts = [float(np.median(value[part])) if part else math.nan for part in halves(shown)]
         if not shown or abs(parts[1] - parts[0]) > SAME_RATIO * abs(parts[0]):
             continue

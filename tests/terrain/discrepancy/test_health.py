@@ -719,6 +719,14 @@ def steady_turns(rates_radps, n=12, duration_s=8.0):
 SIDES, ONE_SIDE = (0.8, -0.6, 0.5, -0.9), (0.7,)
 
 
+def without_heading(run):
+    """Return a run whose lidar logs no yaw rate."""
+    seen = run.streams["lidar"]
+    return replace(
+        run, streams={**run.streams, "lidar": Stream(seen.time_s, seen.values[:, :1], seen.channels[:1])}
+    )
+
+
 def test_an_offset_of_steady_turns_is_found_beside_the_heading_and_is_no_turned_sign():
     runs = steady_turns(SIDES)
     (fault,) = faults(on_one_clock([of_gyro(lambda _, w: w + 0.9)(run) for run in runs]))
@@ -726,6 +734,42 @@ def test_an_offset_of_steady_turns_is_found_beside_the_heading_and_is_no_turned_
     assert fault.change.offset == pytest.approx(-0.9, abs=0.05)
     assert len(fault.run_ids) == len(runs)  # also those whose zero the wheels do not show
     assert faults(on_one_clock(runs)) == ()
+
+
+def test_an_offset_that_few_runs_show_is_that_of_a_body_that_slides():
+    """Of the others, none could show it: their wheels never come near rest."""
+    runs = [without_heading(run) for run in steady_turns(SIDES)]
+    slides = edit(lambda _, v: v + 0.9, odometry="speed_x")
+    odd = [slides(run) if i == 2 else run for i, run in enumerate(sound())]
+    far = [replace(run, run_id=f"far_{i}") for i, run in enumerate(odd[2:3])]
+    assert faults(on_one_clock([*runs, *far])) == ()
+
+
+def test_a_run_whose_zero_is_not_known_does_not_contradict_an_offset():
+    """Its gyro and its heading differ by as much as the offset, as where a lidar's windows begin."""
+    rng, runs = np.random.default_rng(0), steady_turns(SIDES)
+    for i, run in enumerate(runs):
+        runs[i] = of_gyro(lambda _, w: w + 0.9)(run)
+        if i % 3 == 0:
+            runs[i] = edit(lambda t, w: w + 0.8 * np.sign(np.sin(2.0 * t + rng.uniform(0, 6))), lidar="yaw")(
+                runs[i]
+            )
+    found = [fault for fault in faults(on_one_clock(runs)) if fault.change.kind is OFFSET]
+    assert [len(fault.run_ids) for fault in found] == [len(runs)]
+
+
+def test_a_gyro_of_another_scale_has_no_offset_by_its_turns():
+    runs = [of_gyro(lambda _, w: 2.0 * w)(run) for run in steady_turns((2.5, 1.2))]
+    assert OFFSET not in {fault.change.kind for fault in faults(on_one_clock(runs))}
+
+
+def test_what_is_left_of_a_gyro_at_the_end_of_its_range_has_no_scale():
+    runs = [with_lidar(run, 0.16) for run in runs_of(12, 0.1)]
+    kinds = {
+        f.change.kind
+        for f in faults(on_one_clock([of_gyro(lambda _, w: np.clip(w, -0.3, 0.3))(r) for r in runs]))
+    }
+    assert kinds == {FaultKind.SATURATION}
 
 
 def test_a_turned_sign_of_one_steady_turn_may_be_an_offset_and_of_two_is_a_sign():
@@ -783,6 +827,8 @@ def test_a_zero_that_drifts_over_the_runs_is_named_and_taken_off_in_their_order(
         of_gyro(lambda _, w, k=k: w + 0.01 * k)(run) for k, run in zip([5, 17, 11] * 8, runs, strict=True)
     ]
     assert faults(on_one_clock(shuffled)) == ()
+    last = [of_gyro(lambda _, w: w + 2.0)(run) if k == 23 else run for k, run in enumerate(runs)]
+    assert FaultKind.DRIFT not in {fault.change.kind for fault in faults(on_one_clock(last))}
 
 
 def test_a_reading_that_gains_more_in_a_half_of_the_runs_that_one_mends_may_lose_in_the_rest():
