@@ -163,7 +163,9 @@ def run(settings: Settings, progress: Progress = silent) -> Watching:
     for run in held_out:
         groups.setdefault(run.session or "held out", []).append(run)
     changes = [
-        name for name in CHANGES if name == "none" or _changes(CHANGES[name](held_out[0]), held_out[0])
+        name
+        for name in CHANGES
+        if name == "none" or any(_changes(CHANGES[name](each), each) for each in held_out)
     ]
     rows = []
     for name, own in groups.items():
