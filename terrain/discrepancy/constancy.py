@@ -28,7 +28,7 @@ from terrain.discrepancy.evidence import (
     marginal_parts,
     z_of_t,
 )
-from terrain.discrepancy.patterns import MIN_GROUP, SCATTERS, Kind, Pattern, pattern_of
+from terrain.discrepancy.patterns import MIN_GROUP, SCATTERS, Kind, Pattern, fit_scatter, pattern_of
 from terrain.discrepancy.robot_terms import value_in_robot_terms, values_with_intervals
 from terrain.discrepancy.runs import UNLIKE, Excluded, Signals
 from terrain.discrepancy.search import RIVAL_LINEAR, RIVAL_LOSS, CauseFit, Problem, cause_fit, names_of
@@ -277,6 +277,8 @@ Z_NEAR = 3.0  #: Evidence of an effect that may be what varies instead of one wh
 OUT_STDS, OUT_SCATTERS, OUT_RATIO = 3.0, 0.25, 0.2
 """A run's value is out of its bounds by so many standard deviations and scatters, and the ratio of the runs
 that may be: a rogue or two, and less than a group of eight runs."""
+
+CERTAIN_DOF = 1e9  #: Of variances that are known: the noise is that between thirds of each run already
 
 LEAST_RATIO = 1e-4  #: Least scatter of a parameter of which none is assumed, over the prior of its value
 
@@ -529,19 +531,14 @@ def values_by_run(
     precision = 1.0 / (variance + assumed_std**2)
     # one run that is far out is no variation from run to run: the others have to differ as well
     known = np.flatnonzero(seen)
-    likelihood = math.inf  # that a scatter of their own gains, twice its logarithm
+    likelihood, own_std = math.inf, 0.0  # that a scatter of their own gains, twice its logarithm
     for rest in [np.delete(known, i) for i in range(len(known))]:
-        var = 1.0 / precision[rest] + (SCATTERS[:, None] * np.ptp(value[rest])) ** 2
-        middle = (value[rest] / var).sum(axis=1) / (1.0 / var).sum(axis=1)
-        loss = (np.log(var) + (value[rest] - middle[:, None]) ** 2 / var).sum(axis=1)
-        likelihood = min(likelihood, float(loss[0] - loss.min()))
+        about = value[rest], 1.0 / precision[rest], np.ones((len(rest), 1))
+        none, free = (fit_scatter(*about, tried, CERTAIN_DOF) for tried in (SCATTERS[:1], SCATTERS))
+        if none.loss - free.loss < likelihood:
+            likelihood, own_std = none.loss - free.loss, free.scatter * math.sqrt(len(rest) / (len(rest) - 1))
     z = z_of_t(math.sqrt(max(likelihood, 0.0)), TRUST_DOF + dof)
-    # squares about the mean, in variances, those far out limited
-    square = precision * (value - (precision * value).sum() / precision.sum()) ** 2
-    square = np.minimum(square, 9.0 * max(float(np.median(square[precision > 0])), 1.0))
-    beyond = float(square.sum()) - (len(known) - 1)
-    spread = float(precision.sum() - (precision**2).sum() / precision.sum())
-    beyond_noise = math.sqrt(max(beyond / spread, 0.0) + assumed_std**2)
+    beyond_noise = math.hypot(own_std, assumed_std)
     return RunValues(name, value + mean, precision, beyond_noise, z, variance)
 
 

@@ -98,7 +98,7 @@ def pattern_of(
     v, s2, at, n = value[known], variance[known], place[known], int(known.sum())
     if n < MIN_RUNS or not np.ptp(v) > 0.0:
         return None
-    loss, _, _, weight = _fit(v, s2, np.ones((n, 1)))
+    loss, _, _, weight, _ = fit_scatter(v, s2, np.ones((n, 1)))
     off = v - np.average(v, weights=weight)
     cuts, sizes = np.unique(at)[MIN_SIDE : 1 - MIN_SIDE], np.arange(MIN_GROUP, n - MIN_GROUP + 1)
     cuts_value = np.sort(v)[sizes]
@@ -122,7 +122,7 @@ def pattern_of(
             designs.append((kind, of, 0.0))
     best: Pattern | None = None
     for kind, columns, log_choice in designs:
-        own_loss, coefficients, cov, own_weight = _fit(v, s2, columns[known])
+        own_loss, coefficients, cov, own_weight, _ = fit_scatter(v, s2, columns[known])
         if kind in (Kind.GROUPS, Kind.ROGUE) and not _is_apart(
             kind, v, columns[known], coefficients, own_weight
         ):
@@ -147,7 +147,8 @@ def evidence_of_parts(value: Array, variance: Array, second: Array) -> float:
     if known.sum() < MIN_RUNS or parts.sum(axis=0).min() < MIN_GROUP or not np.ptp(value[known]) > 0.0:
         return 0.0
     losses = [
-        _fit(value[known], variance[known], columns)[0] for columns in (parts.sum(axis=1)[:, None], parts)
+        fit_scatter(value[known], variance[known], columns).loss
+        for columns in (parts.sum(axis=1)[:, None], parts)
     ]
     return _z_of_losses(losses[0], losses[1], int(known.sum()), 2, 0.0)
 
@@ -177,17 +178,30 @@ def _is_apart(kind: Kind, value: Array, columns: Array, coefficients: Array, wei
     return max(within) < GROUPS_P
 
 
-def _fit(value: Array, variance: Array, columns: Array) -> tuple[float, Array, Array, Array]:
-    """Return minus twice the log-likelihood of a design, its coefficients, their covariance, and the runs' weights.
+class ScatterFit(NamedTuple):
+    """A design fitted to values of runs that scatter about it."""
 
-    Variances are known up to a factor near 1, as of :data:`TRUST_DOF` values more: what is taken for noise of a run may
-    be common to all of them.
+    loss: float  #: minus twice the log-likelihood, up to what no design changes
+    coefficients: Array
+    cov: Array
+    weight: Array  #: (n,) of the runs
+    scatter: float  #: beyond the noise
+
+
+def fit_scatter(
+    value: Array, variance: Array, columns: Array, scatters: Array = SCATTERS, trust: float = TRUST_DOF
+) -> ScatterFit:
+    """Return the fit of a design (n, m), with the scatter of greatest likelihood of some over the range of the values.
+
+    Variances are known up to a factor near 1, as of ``trust`` values more: what is taken for noise of a run may be
+    common to all of them.
     """
-    weights = 1.0 / (variance + (SCATTERS[:, None] * np.ptp(value)) ** 2)
+    scatters = scatters * np.ptp(value)
+    weights = 1.0 / (variance + scatters[:, None] ** 2)
     covs = np.linalg.pinv(np.einsum("tn,ni,nj->tij", weights, columns, columns), hermitian=True)
     xs = np.einsum("tij,nj,tn->ti", covs, columns, weights * value)
-    squares, n = TRUST_DOF + (weights * (value - xs @ columns.T) ** 2).sum(axis=1), len(value) + TRUST_DOF
-    losses = n * np.log(squares) - np.log(weights).sum(axis=1)
+    squares, n = (weights * (value - xs @ columns.T) ** 2).sum(axis=1), len(value) + trust
+    losses = n * np.log1p(squares / trust) - np.log(weights).sum(axis=1)
     k = int(np.argmin(losses))
-    factor = squares[k] / (n - columns.shape[1])
-    return float(losses[k]), xs[k], covs[k] * factor, weights[k] / factor
+    factor = (trust + squares[k]) / (n - columns.shape[1])
+    return ScatterFit(float(losses[k]), xs[k], covs[k] * factor, weights[k] / factor, float(scatters[k]))
