@@ -33,7 +33,10 @@ from terrain.records import RunLog
 from terrain.robots import Robot, load_robot
 from terrain.simulation.plants.planar import Ground, spread_numbers
 
-N_RUNS, N_CALIBRATION = 12, 24  #: of a trial, and those that the description is calibrated on
+N_RUNS = 12  #: of a trial
+#: Runs that the description is calibrated on, a quarter of an hour: with fewer what is true of a world may stay a
+#: candidate, and is then news in every trial.
+N_CALIBRATION = 60
 MAX_PASSES = 3  #: of the calibration: a builder explains again what an extended description leaves
 OVER_LIMIT = 6.0  #: size of an effect over its detection limit
 CLOSE = 0.15  #: by which that may be missed
