@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -329,6 +330,7 @@ class _OwnValues(NamedTuple):
     runs: list[RunValues]
     loss: float
     gain: float  #: fall of the loss from one value in all runs
+    common: Mapping[str, float] = MappingProxyType({})  #: what all runs share beside these, by parameter
 
     @property
     def clearest(self) -> RunValues:
@@ -374,16 +376,20 @@ def varying_effects(problem: Problem, fit: CauseFit) -> tuple[verdict.Varying, .
     for linear in tried:
         if linear.loss > first.loss + behind:
             continue
-        # by a nonlinear fit: sensitivities of each run at its own values
-        own = linear
+        # by a nonlinear fit: sensitivities of each run at its own values.  What all runs have in common beside the
+        # causes stays: columns of other effects beside those at own values make up for what differs
+        own, names = linear, tuple(dict.fromkeys([*fit.names, *[runs.name for runs in linear.runs]]))
+        base = info.vector.copy()
+        for name, value in linear.common.items():
+            base[INDEX[name]] += 0.0 if name in names else value
         for _ in range(N_STEPS):
             at = {
                 runs.name: np.clip(info.vector[INDEX[runs.name]] + runs.value, *BOUNDS[runs.name])
                 for runs in own.runs
             }
-            there = problem.at(info.origin, [*at], noise=info.noise, scatter={}, own=at)
-            there = info.counted_from(info.origin).with_columns(there).counted_from(info.vector)
-            own = _own_values(there, own, known, columns)
+            there = problem.at(info.origin, names, noise=info.noise, scatter={}, own=at)
+            there = info.counted_from(info.origin).with_columns(there).counted_from(base)
+            own = _own_values(there, own, known, columns, names)
         own = own._replace(runs=[runs.in_pattern(problem.signals) for runs in own.runs])
         of = own.clearest
         (low, high), seen = BOUNDS[of.name], of.weight > 0
@@ -455,10 +461,17 @@ def rogues_among(problem: Problem, fit: CauseFit, runs: Sequence[Signals]) -> tu
     return tuple(rogues)
 
 
-def _own_values(info: Evidence, tried: _OwnValues, known: Mapping[str, float], columns: Array) -> _OwnValues:
+def _own_values(
+    info: Evidence,
+    tried: _OwnValues,
+    known: Mapping[str, float],
+    columns: Array,
+    shared: Sequence[str] | None = None,
+) -> _OwnValues:
     """Fit runs with values of their own of an effect, all else as it is assumed, from a scatter of its parameters.
 
-    With the columns (runs, m) of a pattern, the effect has a value for each of these, and scatters about them.
+    All runs have values in common of the parameters ``shared``, of the whole library by default.  With the columns
+    (runs, m) of a pattern, the effect has a value for each of these, and scatters about them.
     """
     own = [runs.name for runs in tried.runs]
     least = {
@@ -482,15 +495,18 @@ def _own_values(info: Evidence, tried: _OwnValues, known: Mapping[str, float], c
     # the whole library up to its prior, as one more run has it
     prior = np.zeros((1, *gram.shape[1:]))
     prior[0, :k, :k] = info.prior
-    gram, shared = np.concatenate([gram, prior]), range(design.shape[2] - 1)
-    loss, values, std = fit_mixed(gram, shared, random, least_std, start, free)
-    alike, *_ = fit_mixed(gram, range(k), random, least_std, least_std, np.zeros_like(free))
+    gram, shared = np.concatenate([gram, prior]), info.names if shared is None else shared
+    common, of_pattern = info.places(shared), range(k, design.shape[2] - 1)
+    loss, values, std = fit_mixed(gram, [*common, *of_pattern], random, least_std, start, free)
+    alike, *_ = fit_mixed(gram, common, random, least_std, least_std, np.zeros_like(free))
     varies = dict(zip(least, std.tolist(), strict=True))
+    values = values[: len(common)]
     runs = [
-        values_by_run(info, of.name, info.names, values[:k], varies, known.get(of.name, 0.0)).about(of.mean)
+        values_by_run(info, of.name, shared, values, varies, known.get(of.name, 0.0)).about(of.mean)
         for of in tried.runs
     ]
-    return _OwnValues(tried.effect, runs, loss, alike - loss)
+    together = dict(zip(shared, values.tolist(), strict=True))
+    return _OwnValues(tried.effect, runs, loss, alike - loss, together)
 
 
 def values_by_run(

@@ -366,7 +366,7 @@ def test_drives_of_a_car_keep_to_what_it_can_and_part_stiffness_from_a_slide_on_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [0, len(KNOWN) - 1], ids=["plain", "all"])
+@pytest.mark.parametrize("number", [0, 1, len(KNOWN) - 1], ids=["plain", "scatter", "all"])
 def test_a_track_that_is_two_and_a_half_times_as_wide_is_named_in_short_runs(number):
     trial = run_trial(Case(Row.KNOWN, number, "husky", SHORT_RUNS, 0))
     assert TRACK in trial.named
@@ -375,6 +375,8 @@ def test_a_track_that_is_two_and_a_half_times_as_wide_is_named_in_short_runs(num
     _, low, high = trial.intervals[TRACK_RATIO]
     # the mean of runs that scatter is no constant to be met
     assert low < TRACK_ERROR < high or number > 0
+    # that scatter is of the track, and of no effect that is like it in turns of one speed
+    assert all(TRACK in (each.name, *each.rivals) for each in trial.varying)
     assert set(trial.stalled) <= set(trial.excluded)
     assert len(trial.excluded) <= len(trial.stalled) + 1
 
