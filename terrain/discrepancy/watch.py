@@ -47,7 +47,7 @@ from terrain.discrepancy.runs import (
     signals_of,
 )
 from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
-from terrain.errors import ConfigError
+from terrain.errors import ConfigError, TerrainError
 from terrain.extension import region_of
 from terrain.files.documents import check_keys, is_number, read_yaml
 from terrain.files.names import shown
@@ -226,7 +226,7 @@ def block_of(run: RunLog, simulation: Simulation, clock_hz: float) -> Block:
     try:
         return Block(begin_s, *_compared(run, simulation, clock_hz))
     except Exception as error:  # whatever broken samples lead to, it must not stop a live chain
-        return Block(begin_s, Status.SILENT, str(error) or type(error).__name__)
+        return Block(begin_s, Status.SILENT, str(error) if isinstance(error, TerrainError) else repr(error))
 
 
 def _compared(
