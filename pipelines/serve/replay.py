@@ -28,7 +28,7 @@ from pipelines.serve.serve import Settings, loaded, stopping
 from terrain.control.robot_control import PilotSettings, check_table
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.discrepancy.runs import in_order
-from terrain.discrepancy.watch import BLOCK_S, WORDS, Alarm, Watch, read_watched
+from terrain.discrepancy.watch import BLOCK_S, WORDS, Alarm, Watch, clock_text, read_watched
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live import CHANNELS
 from terrain.files.names import printable
@@ -364,15 +364,14 @@ def report(result: ReplayResult) -> Report:
 def _watched(result: ReplayResult) -> list[Part]:
     """Return the departures, and why blocks could not be compared."""
     rows = [
-        (each.run_id, each.text, each.raised_s, each.over_s, WORDS[each.channel][0]) for each in result.alarms
+        (
+            *(each.run_id, each.text, each.raised_s),
+            f"{clock_text(each.over_s)} of {each.over_run_id}" if each.over_run_id else "",
+            WORDS[each.channel][0],
+        )
+        for each in result.alarms
     ]
-    heads = (
-        "run",
-        Column("departure", long=True),
-        Column("raised", ".1f", "s"),
-        Column("over", ".1f", "s"),
-        "channel",
-    )
+    heads = ("run", Column("departure", long=True), Column("raised", ".1f", "s"), "over", "channel")
     parts: list[Part] = [Table(heads, rows)] if rows else []
     whys = Counter(block.why for block in result.blocks if block.why)
     return parts + [

@@ -121,6 +121,7 @@ class Alarm(NamedTuple):
     run_id: str = ""  #: of a log: where it was raised, and where it began
     since_run_id: str = ""
     over_s: float = math.nan  #: when it was over; NaN while it is not
+    over_run_id: str = ""
 
     @property
     def text(self) -> str:
@@ -593,7 +594,8 @@ class Watch:
         if now.value <= 0.0:
             now = Sum()
             if i is not None:
-                self.alarms[i] = self.alarms[self._open.pop(place)]._replace(over_s=end_s)
+                del self._open[place]
+                self.alarms[i] = self.alarms[i]._replace(over_s=end_s, over_run_id=self.run_id)
                 self.news.append(f"over at {clock_text(end_s)}: {self.alarms[i].text}")
         elif i is not None and now.value >= threshold:  # not while it ends: that would be a mean of both
             self.alarms[i] = self.alarms[i]._replace(size=now.off / now.of)

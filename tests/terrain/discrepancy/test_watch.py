@@ -133,6 +133,9 @@ def test_an_alarm_is_held_until_the_departure_is_over(hide, watched):
     for alarm in watch.alarms:
         assert alarm.run_id in [run.run_id for run in changed]
         assert np.isfinite(alarm.over_s)
+        # it ends in a run that is quiet, by the clock of that run
+        assert alarm.over_run_id in [run.run_id for run in quiet]
+        assert alarm.over_s < max(run.end_s for run in quiet)
     assert not watch.current
 
 
