@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.optimize import nnls
 from scipy.special import ndtri
 from scipy.stats import t as student
 
@@ -19,18 +18,15 @@ from terrain.discrepancy.compared import ComparedRun
 from terrain.discrepancy.earned import units_of
 from terrain.discrepancy.evidence import Evidence
 from terrain.discrepancy.learner import Learned
+from terrain.discrepancy.noise import TINY, growth_of
 from terrain.discrepancy.runs import LowPass, Signals, measured_channels
 from terrain.effects import CHANNELS, GYRO, HEADING
 from terrain.records import Array
 
 COVERED = 0.95  #: Part of the rows of a further run that the band holds.
 TAIL = 0.5 + 0.5 * COVERED  #: Probability up to its upper edge.
+N_FITS = 5  #: Of a variance, each weighted by that of the one before.
 MIN_UNITS = 3  #: Least number of runs, or sessions, that a deviation is estimated from.
-LEAST = (
-    0.02  #: Part of the mean square that a row weighs as in the fit, so that those at rest are not all of it.
-)
-TINY = 1e-30  #: A square of nothing, by which is divided.
-N_FITS = 5  #: Of the fit by weights that follow from the one before.
 
 
 def left_out_residuals(
@@ -101,7 +97,7 @@ def deviation_of(
         n = len(np.unique(of[known]))
         if n < MIN_UNITS or not r[known].any():
             continue
-        rest, per_speed, per_turn = np.sqrt(_growth(powers[known], r[known] ** 2)).tolist()
+        rest, per_speed, per_turn = np.sqrt(growth_of(powers[known], r[known] ** 2, N_FITS)).tolist()
         own = ChannelDeviation(rest, per_speed, per_turn, 1.0, n)
         times_95 = _factor(r[known] / own.std(speed[known], turn[known]), of[known])
         channels[name] = own._replace(times_95=times_95)
@@ -120,17 +116,3 @@ def _factor(ratio: Array, units: Array) -> float:
     apart = np.bincount(of, weights=ratio**2 - square) / len(ratio)
     freedom = max(2.0 * square**2 * (n - 1) / n / max(float(apart @ apart), TINY), 1.0)
     return float(np.quantile(np.abs(ratio), COVERED) * student.ppf(TAIL, freedom) / ndtri(TAIL))
-
-
-def _growth(powers: Array, square: Array) -> Array:
-    """Return the coefficients (k,), none negative, by which squares (m,) grow with powers (m, k).
-
-    Weights are those of squares whose scatter is as large as their mean.
-    """
-    mean = max(float(square.mean()), TINY)
-    size = np.array([mean, *np.zeros(powers.shape[1] - 1)])
-    for _ in range(N_FITS):
-        weight = 1.0 / np.maximum(powers @ size, LEAST * mean)
-        size = nnls(powers * weight[:, None], square * weight)[0]
-        size[0] = max(size[0], LEAST * mean)
-    return size

@@ -148,3 +148,34 @@ def whiten(filters: Array, x: Array) -> Array:
                 if total == total:
                     out[j, row, i] = total
     return out
+
+
+TINY = 1e-30  #: A square of nothing, by which is divided
+LEAST_VARIANCE = (
+    0.02  #: Ratio of the mean square that a variance is at the least: rows at rest are not all of a fit
+)
+
+
+def growth_of(powers: Array, square: Array, n_fits: int, cut: float = np.inf) -> Array:
+    """Return the coefficients (k,), none negative, by which squares (m,) grow with powers (m, k), the first of them 1.
+
+    Weights are those of squares whose scatter is as large as their mean, by the fit before, of ``n_fits``; ``cut``
+    standard deviations are the most that a row counts.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> speed = rng.uniform(0.0, 2.0, 20000)
+    >>> square = (0.1 + 0.3 * speed**2) * rng.standard_normal(20000) ** 2
+    >>> growth_of(np.column_stack([np.ones_like(speed), speed**2]), square, 5).round(2)
+    array([0.1, 0.3])
+    """
+    from scipy.optimize import nnls
+
+    mean = max(float(square.mean()), TINY)
+    growth = np.array([mean, *np.zeros(powers.shape[1] - 1)])
+    for _ in range(n_fits):
+        variance = np.maximum(powers @ growth, LEAST_VARIANCE * mean)
+        growth = nnls(powers / variance[:, None], np.minimum(square / variance, cut**2))[0]
+        growth[0] = max(growth[0], LEAST_VARIANCE * mean)
+    return growth

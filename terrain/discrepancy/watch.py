@@ -31,11 +31,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq, nnls
+from scipy.optimize import brentq
 from scipy.stats import chi2
 from scipy.stats import t as student
 
 from terrain.discrepancy.compared import CHANNEL_WORDS
+from terrain.discrepancy.noise import growth_of
 from terrain.discrepancy.runs import (
     CUTOFF_HZ,
     MAX_RATE_HZ,
@@ -67,8 +68,8 @@ LEAST_BLOCKS = 8  #: Of which a deviation can be stated.
 LEAST_KNOWN = 0.25  #: Ratio of a block's rows that have to be known.
 LEAST_MOTION = 0.25  #: Ratio of the quiet runs' median ``e`` below which a block does not show a ratio.
 STANDSTILL_MPS = 0.03  #: Of the fastest row of a block.
-N_FITS = 10  #: Of the variance, each weighted by that of the one before.
 LEAST_RATIO = 0.1  #: Of what is usual over the prediction, for a departure in percent.
+N_FITS = 10  #: Of the variance, each weighted by that of the one before.
 MEMORY_BLOCKS = 10  #: Longest memory of blocks.
 OTHER_CLOCK = 0.1  #: Ratio by which the clock may differ from that of the quiet runs.
 SCHEMA = 1  #: Version of the section that is read and written.
@@ -324,12 +325,8 @@ def _deviation(blocks: Sequence[tuple[str, float, float, float]], kind: str) -> 
     n, square = len(figure), figure**2
     if n < LEAST_BLOCKS or not square.any():
         return None
-    powers, mean = np.column_stack([np.ones(n), e]), float(square.mean())
-    growth = np.array([mean, 0.0])
-    for _ in range(N_FITS):  # what is far out is cut off here as it is in z
-        variance = np.maximum(powers @ growth, 0.02 * mean)
-        growth = nnls(powers / variance[:, None], np.minimum(square / variance, CUT**2))[0]
-        growth[0] = max(growth[0], 0.02 * mean)
+    powers = np.column_stack([np.ones(n), e])
+    growth = growth_of(powers, square, N_FITS, CUT)  # what is far out is cut off here as it is in z
     places, memory = np.unique(of_session, return_inverse=True)[1], 1.0
     for _ in range(2):  # cut off as it is over the memory
         most = CUT * math.sqrt(memory)
