@@ -8,6 +8,7 @@ from studies.blind_trials.drives import rich_drives
 from studies.blind_trials.trial import hidden_runs
 
 from pipelines.serve import replay
+from pipelines.serve.hub import Limits
 from pipelines.serve.serve import Settings
 from pipelines.serve.service import Service
 from terrain.discrepancy.watch import watch_lines, watched_on
@@ -63,7 +64,8 @@ def test_a_replay_tells_the_departures_over_time(replayed, extended):
 def test_a_service_says_what_the_replay_says(extended, changed, replayed, capfd):
     streams = {name: stream.channels for name, stream in changed.streams.items() if name != "truth"}
     seen = []
-    with running(watch=str(extended)) as service, service.socket() as robot:
+    faster_than_real_time = Limits()._replace(rows_per_s=1e6, messages_per_s=1e6, bytes_per_s=1e9)
+    with running(faster_than_real_time, watch=str(extended)) as service, service.socket() as robot:
         assert ask(robot, hello("mine", robot="husky", streams=streams))["served"]["model"] is None
         for message in messages(changed, 5.0):
             seen.append(ask(robot, message)["observation"]["watch"])
