@@ -26,8 +26,8 @@ HOLD_OUT_FROM, HOLD_OUT_EVERY = 6, 4  #: With so many runs or more, one in every
 def split_runs(runs: Sequence[RunLog], hold_out: int | None, seed: int) -> tuple[list[RunLog], list[RunLog]]:
     """Return the runs for the diagnosis and those held out; of sessions, where there are several, whole ones.
 
-    Runs (sessions) are put in a random order, terrain after terrain, and of ``n`` that are held out every
-    ``len(runs) / n``-th is taken, so that each terrain contributes in proportion.
+    Runs (sessions) are put in a random order, and of ``n`` that are held out every ``len(runs) / n``-th is taken.  The
+    order knows nothing of labels, so that the same logs are split alike under any.
 
     Parameters
     ----------
@@ -40,10 +40,8 @@ def split_runs(runs: Sequence[RunLog], hold_out: int | None, seed: int) -> tuple
         if too few would be left for the diagnosis.
     """
     units = units_of(runs)
-    first = {unit: run for run, unit in zip(reversed(runs), reversed(units), strict=True)}
-    names = sorted(first, key=units.index)
-    drawn = np.random.default_rng(seed).permutation(len(names))
-    order = sorted((names[i] for i in drawn), key=lambda unit: first[unit].terrains)
+    names = list(dict.fromkeys(units))
+    order = [names[i] for i in np.random.default_rng(seed).permutation(len(names))]
     most = math.ceil(len(names) / HOLD_OUT_EVERY)
     if hold_out is not None:
         most = len(names) if hold_out else 0

@@ -81,10 +81,13 @@ def test_no_gain_is_claimed_for_nothing_for_the_wrong_sign_or_where_nothing_is_h
 # -- Which runs are held out of a diagnosis, and which of them have the faults that were found in the others --
 
 
-def test_every_terrain_is_held_out_in_proportion_and_the_seed_chooses_runs():
+def test_the_seed_chooses_the_runs_held_out_and_no_label_does():
     runs = [RunLog(f"{name}{i}", "husky", {}, ((0.0, 1.0, name),)) for name in "ab" for i in range(8)]
     used, held = split_runs(runs, None, 0)
-    assert sorted(run.terrains for run in held) == [("a",)] * 2 + [("b",)] * 2
+    assert len(held) == 4
+    for labels in ((), ((0.0, 1.0, "grass"),)):
+        others = [replace(run, labels=labels if i % 3 else ()) for i, run in enumerate(runs)]
+        assert [run.run_id for run in split_runs(others, None, 0)[1]] == [run.run_id for run in held]
     assert {run.run_id for run in used} | {run.run_id for run in held} == {run.run_id for run in runs}
     assert split_runs(runs, None, 0) == (used, held)
     assert any(split_runs(runs, None, seed)[1] != held for seed in range(1, 4))
