@@ -269,10 +269,15 @@ def _why(result: ExplainResult) -> str:
 def _how_certain(result: ExplainResult) -> str:
     """Return the intervals of what is built in, the candidates, and what these drives could not have shown."""
     diagnosis, parts = result.diagnosis, []
-    for cause in diagnosis.built_in:
-        tier = "confirmed on held-out runs" if cause.tier is Tier.NAMED else "one of a set that is confirmed"
-        values = enumerated([value_in_robot_terms(*v[:2], *v[3:], result.robot) for v in cause.parameters])
-        parts.append(f"{effect_label(cause.name)} {values}: {tier}")
+    for tier, words in ((Tier.NAMED, "confirmed on held-out runs"), (Tier.SET, "confirmed as one of a set")):
+        values = [
+            f"{effect_label(cause.name)} "
+            + enumerated([value_in_robot_terms(*v[:2], *v[3:], result.robot) for v in cause.parameters])
+            for cause in diagnosis.built_in
+            if cause.tier is tier
+        ]
+        if values:
+            parts.append(f"{words}, with 95 % intervals: {enumerated(values)}")
     if diagnosis.candidates:
         shown = enumerated([effect_label(each.name) for each in diagnosis.candidates[:STATED]])
         more = f" and {n} more" if (n := len(diagnosis.candidates) - STATED) > 0 else ""

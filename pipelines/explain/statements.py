@@ -231,9 +231,12 @@ def varying_text(effect: Varying) -> str:
         name = f"{name} ({PARAMETER[effect.parameter].label})"
     by = values_with_intervals([Value(effect.parameter, abs(effect.change), effect.unit, *ends)])
     rises, parts = effect.change > 0.0, []
-    for value, _, runs in effect.groups:
+    for value, _, runs, of in effect.groups:
         n, names = len(runs), ", ".join((*runs[:SHOWN_RUNS], *["..."] * (len(runs) > SHOWN_RUNS)))
-        parts.append(f"{quantity(effect.parameter, value)} in {n} run{'s' * (n != 1)} ({names})")
+        where = f"in {n} run{'s' * (n != 1)} ({names})"
+        if of:
+            where = f"{'on' if effect.pattern is Kind.TERRAINS else 'in'} {of} ({n})"
+        parts.append(f"{quantity(effect.parameter, value)} {where}")
     if effect.pattern is Kind.TREND:
         text = f"The {name} {'rises' if rises else 'falls'} by {by} over these {effect.n_runs} runs."
     elif effect.pattern is Kind.CHANGE:

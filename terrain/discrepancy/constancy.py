@@ -589,7 +589,9 @@ def _in_words(
         mine = np.flatnonzero((found.columns[:, k] > 0) & np.isfinite(of.variance))
         std = math.sqrt(float(found.cov[k, k]))
         runs = tuple(signals[i].run_id for i in mine.tolist())
-        groups.append(verdict.RunGroup(float(found.coefficients[k]), std, runs))
+        named = {Kind.SESSIONS: signals[mine[0]].session, Kind.TERRAINS: signals[mine[0]].terrain}
+        value, name = float(found.coefficients[k]), named.get(found.kind, "")
+        groups.append(verdict.RunGroup(value, std, runs, name))
     apart = np.zeros(len(found.coefficients))
     apart[order[-1]], apart[order[0]] = 1.0, -1.0
     last = latest(np.array([0.0, 1.0])) if found.kind is Kind.CHANGE else None

@@ -73,7 +73,7 @@ def in_robot_terms(effect: str, values: Sequence[Value], robot: Robot) -> str:
 
 
 def value_in_robot_terms(parameter: str, value: float, low: float, high: float, robot: Robot) -> str:
-    """Return a value and its interval by the number of the description that it changes, or as they are.
+    r"""Return a value and its interval by the number of the description that it changes, or as they are.
 
     Examples
     --------
@@ -81,14 +81,15 @@ def value_in_robot_terms(parameter: str, value: float, low: float, high: float, 
     >>> value_in_robot_terms("effective_track_ratio", 1.5, 1.47, 1.53, load_robot("husky"))
     '1.43 m (1.41 to 1.44)'
     >>> value_in_robot_terms("one_sided_radius_ratio", 0.025, 0.02, 0.03, load_robot("husky"))
-    '0.025 (0.020 to 0.030)'
+    '2.5\xa0% (2 to 3\xa0%)'
     """
     given = robot.effects.get(parameter, 0.0)
     numbers, unit = [given + each for each in (value, low, high)], PARAMETER[parameter].unit
     bases = [basis_of(robot, parameter, number)[:1] for number in numbers]
-    if all(basis and basis[0].is_described for basis in bases):
-        numbers = [basis[0].extended for basis in bases]
-        unit = bases[0][0].field.rpartition("_")[2]
+    if not all(basis and basis[0].is_described for basis in bases):
+        return values_with_intervals([Value(parameter, numbers[0], unit, *numbers[1:])])
+    numbers = [basis[0].extended for basis in bases]
+    unit = bases[0][0].field.rpartition("_")[2]
     at, *ends = (rounded(number, 0.5 * abs(numbers[2] - numbers[1])) for number in numbers)
     low_end, high_end = sorted(ends, key=float)
     return f"{f'{at} {UNITS.get(unit, unit)}'.strip()} ({low_end} to {high_end})"

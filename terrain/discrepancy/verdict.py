@@ -86,6 +86,7 @@ class RunGroup(NamedTuple):
     value: float
     std: float
     runs: tuple[str, ...]
+    name: str = ""  #: of their session or terrain, where that is what they have in common
 
 
 class Varying(NamedTuple):

@@ -115,7 +115,7 @@
     const categories = bars.length ? bars[0].x : null, width = holder.clientWidth;
     const vertical = { count: bars.length, order: new Map(bars.map((mark, i) => [mark, i])) };
     const height = categories ? 46 + Math.max(1, 0.7 * bars.length) * 24 * categories.length
-      : panel.equal ? Math.min(460, width) : thin ? 58 + (panel.x_label || (last && figure.x_label) ? 18 : 0) : 230;
+      : panel.equal ? Math.min(460, width) : thin ? 58 + (panel.x_label || (last && figure.x_label) ? 18 : 0) : holder.closest(".answer") ? 170 : 230;
     const full = ranges(panel, categories), zoom = group.zoom, zoomY = { y: null };
     if (panel.equal) {
       const per = Math.max((full.x[1] - full.x[0]) / (width - 70), (full.y[1] - full.y[0]) / (height - 50));
