@@ -38,6 +38,7 @@ from terrain.discrepancy.robot_terms import (
 from terrain.discrepancy.runs import measured_channels
 from terrain.discrepancy.verdict import Cause, ChannelVerdict, Diagnosis, Tier
 from terrain.effects import GYRO, HEADING, PARAMETER, effect_named
+from terrain.learned_term import LearnedTerm
 from terrain.robots import Robot
 
 ERROR_LABELS = {
@@ -254,8 +255,8 @@ def _why(result: ExplainResult) -> str:
         built = [cause for cause in diagnosis.of_sets if cause.name in names]
         as_one = f" (built in as {_terms(built[0], result)})" if built else ""
         parts.append(f"one of {members}{as_one}")
-    parts += [varying_text(effect).removesuffix(".") for effect in diagnosis.varying]
-    if terms := result.diagnosed.with_terms.learned:
+    parts += [varying_text(effect, result.robot).removesuffix(".") for effect in diagnosis.varying]
+    if terms := _learned_terms(result)[0]:
         more = [f"{n} more below"] if (n := len(terms) - LEARNED) > 0 else []
         parts.append(
             f"without a known cause, learned: {enumerated([*[t.says for t in terms[:LEARNED]], *more])}"
@@ -264,6 +265,15 @@ def _why(result: ExplainResult) -> str:
     if unexplained:
         parts.append(f"no known cause for {enumerated(unexplained)}")
     return _sentences(parts) or "Nothing is to be explained."
+
+
+def _learned_terms(result: ExplainResult) -> tuple[list[LearnedTerm], list[LearnedTerm]]:
+    """Return the learned terms that are built in, and apart those that are no better on the runs held out."""
+    no_better = {
+        each.channel for each in result.diagnosed.learned_gains if each.reduction <= each.named_reduction
+    }
+    terms = result.diagnosed.with_terms.learned
+    return [t for t in terms if t.channel not in no_better], [t for t in terms if t.channel in no_better]
 
 
 def _how_certain(result: ExplainResult) -> str:
@@ -282,6 +292,9 @@ def _how_certain(result: ExplainResult) -> str:
         shown = enumerated([effect_label(each.name) for each in diagnosis.candidates[:STATED]])
         more = f" and {n} more" if (n := len(diagnosis.candidates) - STATED) > 0 else ""
         parts.append(f"not confirmed, and not built in: {shown}{more}")
+    if no_better := _learned_terms(result)[1]:
+        names = enumerated([CHANNEL_WORDS[term.channel][0] for term in no_better])
+        parts.append(f"no better on held-out runs: what was learned of {names}")
     if n := len(diagnosis.not_shown):
         of = len(diagnosis.detection_limits)
         parts.append(f"these drives cannot test {n} of {of} parameters, which may be wrong all the same")

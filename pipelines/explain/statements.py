@@ -12,7 +12,13 @@ from pipelines.report.numbers import enumerated
 from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, Slope, off_by, slopes_of
 from terrain.discrepancy.gain import Gain
 from terrain.discrepancy.patterns import Kind
-from terrain.discrepancy.robot_terms import UNITS, in_robot_terms, quantity, values_with_intervals
+from terrain.discrepancy.robot_terms import (
+    UNITS,
+    in_robot_terms,
+    quantity_in_robot_terms,
+    value_in_robot_terms,
+    values_with_intervals,
+)
 from terrain.discrepancy.runs import TerrainMatch
 from terrain.discrepancy.verdict import Diagnosis, RuledOut, Value, Varying
 from terrain.effects import PARAMETER, TRACKED, effect_named
@@ -216,27 +222,29 @@ def percent_text(ratio: float, unit: str = f"{NBSP}%") -> str:
     return f"{100.0 * ratio:.0f}{unit}".replace("-", MINUS)
 
 
-def varying_text(effect: Varying) -> str:
+def varying_text(effect: Varying, robot: Robot) -> str:
     r"""Return how an effect differs from run to run, in a sentence or two.
 
     Examples
     --------
+    >>> from terrain.robots import load_robot
     >>> about = "wheel_radius", "wheel_radius_ratio", "ratio", (), -0.035, 0.022, 10.2, (), "speed_x_mps"
-    >>> varying_text(Varying(*about, Kind.TREND, -0.07, (-0.072, -0.068), None, 20)).replace("\xa0", " ")
+    >>> trend = Varying(*about, Kind.TREND, -0.07, (-0.072, -0.068), None, 20)
+    >>> varying_text(trend, load_robot("husky")).replace("\xa0", " ")
     'The wheel radius falls by 7 % (6.8 to 7.2 %) over these 20 runs.'
     """
-    mean, scatter = (quantity(effect.parameter, value) for value in (effect.mean, effect.scatter))
+    mean, scatter = quantity_in_robot_terms(effect.parameter, effect.mean, effect.scatter, robot)
     name, ends = effect_label(effect.name), sorted(map(abs, effect.change_ci))
     if effect.name not in effect.parameter:
         name = f"{name} ({PARAMETER[effect.parameter].label})"
     by = values_with_intervals([Value(effect.parameter, abs(effect.change), effect.unit, *ends)])
     rises, parts = effect.change > 0.0, []
-    for value, _, runs, of in effect.groups:
+    for value, std, runs, of in effect.groups:
         n, names = len(runs), ", ".join((*runs[:SHOWN_RUNS], *["..."] * (len(runs) > SHOWN_RUNS)))
         where = f"in {n} run{'s' * (n != 1)} ({names})"
         if of:
             where = f"{'on' if effect.pattern is Kind.TERRAINS else 'in'} {of} ({n})"
-        parts.append(f"{quantity(effect.parameter, value)} {where}")
+        parts.append(f"{quantity_in_robot_terms(effect.parameter, value, std, robot)[0]} {where}")
     if effect.pattern is Kind.TREND:
         text = f"The {name} {'rises' if rises else 'falls'} by {by} over these {effect.n_runs} runs."
     elif effect.pattern is Kind.CHANGE:
@@ -252,9 +260,10 @@ def varying_text(effect: Varying) -> str:
             f"The {name} differs from run to run: {mean} on average, with a standard deviation of {scatter}."
         )
     if effect.latest is not None:
+        last = effect.latest
+        latest = value_in_robot_terms(last.name, last.value, last.low, last.high, robot)
         text += (
-            f" The extended robot has its value after the last run, {values_with_intervals([effect.latest])}, for "
-            "which no gain is claimed."
+            f" The extended robot has its value after the last run, {latest}, for which no gain is claimed."
         )
     if effect.rivals:
         rivals = enumerated([effect_label(rival) for rival in effect.rivals], "or")

@@ -83,16 +83,43 @@ def value_in_robot_terms(parameter: str, value: float, low: float, high: float, 
     >>> value_in_robot_terms("one_sided_radius_ratio", 0.025, 0.02, 0.03, load_robot("husky"))
     '2.5\xa0% (2 to 3\xa0%)'
     """
-    given = robot.effects.get(parameter, 0.0)
-    numbers, unit = [given + each for each in (value, low, high)], PARAMETER[parameter].unit
-    bases = [basis_of(robot, parameter, number)[:1] for number in numbers]
-    if not all(basis and basis[0].is_described for basis in bases):
-        return values_with_intervals([Value(parameter, numbers[0], unit, *numbers[1:])])
-    numbers = [basis[0].extended for basis in bases]
-    unit = bases[0][0].field.rpartition("_")[2]
+    found = _numbers(parameter, (value, low, high), robot)
+    if found is None:
+        given = robot.effects.get(parameter, 0.0)
+        return values_with_intervals([Value(parameter, given + value, "", given + low, given + high)])
+    numbers, unit = found
     at, *ends = (rounded(number, 0.5 * abs(numbers[2] - numbers[1])) for number in numbers)
     low_end, high_end = sorted(ends, key=float)
     return f"{f'{at} {UNITS.get(unit, unit)}'.strip()} ({low_end} to {high_end})"
+
+
+def quantity_in_robot_terms(parameter: str, value: float, scatter: float, robot: Robot) -> tuple[str, str]:
+    r"""Return a value, and a scatter about it, by the number of the description that it changes, or as they are.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> quantity_in_robot_terms("effective_track_ratio", 1.5, 0.17, load_robot("husky"))
+    ('1.43\xa0m', '97\xa0mm')
+    >>> quantity_in_robot_terms("one_sided_radius_ratio", 0.025, 0.01, load_robot("husky"))
+    ('2.5\xa0%', '1\xa0%')
+    """
+    found = _numbers(parameter, (value, value - scatter, value + scatter), robot)
+    if found is None:
+        return quantity(parameter, robot.effects.get(parameter, 0.0) + value), quantity(parameter, scatter)
+    (at, low, high), unit = found
+    half = 0.5 * abs(high - low)
+    return f"{rounded(at, half)}{NBSP}{UNITS.get(unit, unit)}".rstrip(NBSP), quantity(f"_{unit}", half)
+
+
+def _numbers(parameter: str, values: Sequence[float], robot: Robot) -> tuple[list[float], str] | None:
+    """Return numbers of the description with values added, and their unit; None where no number is described."""
+    given = robot.effects.get(parameter, 0.0)
+    bases = [basis_of(robot, parameter, given + value)[:1] for value in values]
+    if not all(basis and basis[0].is_described for basis in bases):
+        return None
+    unit = bases[0][0].field.rpartition("_")[2]
+    return [basis[0].extended for basis in bases], unit
 
 
 def quantity(parameter: str, value: float) -> str:

@@ -113,9 +113,10 @@
   function plot(holder, figure, panel, group, last) {
     const thin = isThin(panel), { own, drawn } = taken(panel, figure, thin), bars = drawn.filter((mark) => mark.kind === "bars");
     const categories = bars.length ? bars[0].x : null, width = holder.clientWidth;
+    const first = holder.closest(".answer"), label = panel.y_label || undefined;  // its label above: it is low
     const vertical = { count: bars.length, order: new Map(bars.map((mark, i) => [mark, i])) };
     const height = categories ? 46 + Math.max(1, 0.7 * bars.length) * 24 * categories.length
-      : panel.equal ? Math.min(460, width) : thin ? 58 + (panel.x_label || (last && figure.x_label) ? 18 : 0) : holder.closest(".answer") ? 170 : 230;
+      : panel.equal ? Math.min(460, width) : thin ? 58 + (panel.x_label || (last && figure.x_label) ? 18 : 0) : first ? 190 : 230;
     const full = ranges(panel, categories), zoom = group.zoom, zoomY = { y: null };
     if (panel.equal) {
       const per = Math.max((full.x[1] - full.x[0]) / (width - 70), (full.y[1] - full.y[0]) / (height - 50));
@@ -140,7 +141,7 @@
     const axes = [
       { stroke: ink, grid, ticks: grid, font, labelFont: font, labelSize: 18, size: 34, label: panel.x_label || (last ? figure.x_label : "") || undefined },
       { stroke: ink, grid: categories ? { show: false } : grid, ticks: grid, font, labelFont: font, labelSize: 18,
-        size: categories ? Math.min(width * 0.42, 22 + longest) : 54, label: panel.y_label || undefined,
+        size: categories ? Math.min(width * 0.42, 22 + longest) : 54, label: first ? undefined : label,
         values: (u, splits) => categories ? splits.map((i) => shortened(categories[i] ?? "", width * 0.42)) : splits.map(written) },
     ];
     axes[1].show = !thin;
@@ -148,7 +149,7 @@
     if (panel.log_x) Object.assign(axes[0], { splits: (u, axis, low, high) => decades(low, high),
       values: (u, splits) => splits.map(written), filter: (u, splits) => splits });
     const u = new uPlot({
-      width, height, series, axes, title: panel.title || (thin && panel.y_label) || undefined,
+      width, height, series, axes, title: panel.title || ((thin || first) && label) || undefined,
       legend: { show: thin ? last : series.length > 2 || !panel.y_label, live: !categories && !thin },
       cursor: { sync: { key: group.key }, drag: { x: true, y: !categories, uni: 40, setScale: false },
         bind: { dblclick: () => () => { zoom.x = null; zoomY.y = null; group.redraw(); return null; } } },

@@ -175,14 +175,15 @@ LEFT = (
                 "A clock rate of any size that is likely (up to 2 %) would not have been detected.",
                 "An effective track off by under 4.8 % would not have been detected.",
                 "scrub The runs show nothing of it. 0.4",
-                "The payload differs between two groups of runs by 30 % (26 to 34 %): 0 % in 2 runs (a, b) and 30 % "
-                "in 6 runs (c, d, e, f, g, ...). These runs do not distinguish that from scrub",
+                "The payload differs between two groups of runs by 30 % (26 to 34 %): 50.0 kg in 2 runs (a, b) and "
+                "65.0 kg in 6 runs (c, d, e, f, g, ...). These runs do not distinguish that from scrub",
             ),
         ),
         (
             {"varying": (PAYLOAD._replace(pattern=Kind.TERRAINS, groups=ON_TERRAINS),)},
             (
-                "The payload differs between terrains by 30 % (26 to 34 %): 0 % on sand (2) and 30 % on grass (6).",
+                "The payload differs between terrains by 30 % (26 to 34 %): 50.0 kg on sand (2) and 65.0 kg "
+                "on grass (6).",
             ),
         ),
         (
