@@ -432,7 +432,10 @@ def _undo_wheel_dead_zone(block: Block, dead_mps: float) -> None:
 
 
 def _undo_drive_backlash(block: Block, half_rad: float) -> None:
-    """Pass the distance of each wheel through the play; its speed is that part of the motor's that it moves by."""
+    """Pass the distance of each wheel through the play; its speed is that part of the motor's that it moves by.
+
+    That is the mean of the steps before and after a sample, the latter at its speed.
+    """
     for i, factor in _wheel_columns(block):
         half = half_rad * block.robot.wheel_radius_m / factor
         name = f"play {block.stream} {block.channels[i]}"
@@ -440,10 +443,13 @@ def _undo_drive_backlash(block: Block, half_rad: float) -> None:
         known = np.isfinite(block.values[:, i]) & np.isfinite(block.time_s)
         for k in np.flatnonzero(known).tolist():
             speed, time_s = float(block.values[k, i]), float(block.time_s[k])
-            step = 0.5 * (last + speed) * max(time_s - last_s, 0.0) if math.isfinite(last) else 0.0
+            dt = max(time_s - last_s, 0.0) if math.isfinite(last) else 0.0
+            step, coming = 0.5 * dt * (last + speed) if dt else 0.0, dt * speed
             now = min(max(ahead - step, -half), half)
-            if step != 0.0:
-                block.values[k, i] *= (step + (now - ahead)) / step
+            after = min(max(now - coming, -half), half)
+            if coming != 0.0:
+                carried = 1.0 + (after - now) / coming
+                block.values[k, i] *= 0.5 * (carried + (1.0 + (now - ahead) / step if step else carried))
             last, last_s, ahead = speed, time_s, now
         block.memory[name] = last, last_s, ahead
 

@@ -254,6 +254,8 @@ def judged(found: Found, on: HeldOut) -> tuple[Found, Judgement]:
         worst = min(doubtful, key=lambda cause: judgement.removed[cause.name][0])
         problem, withdrawn = found.problem, dict(found.withdrawn)
         fit = _withdraw(problem, found.fit, worst, judgement.reasons[worst.name], withdrawn)
+        removed, interval = judgement.removed[worst.name]
+        withdrawn[worst.name] = withdrawn[worst.name]._replace(held_out_gain=removed, gain_ci=interval)
         fit = _withdraw_wrong(problem, fit, withdrawn)
         fit = _likeliest(problem, fit, found.start, withdrawn)
         found = found._replace(fit=fit, withdrawn=withdrawn)
@@ -280,7 +282,8 @@ def statement_of(found: Found, judgement: Judgement) -> verdict.Diagnosis:
         c = int(np.argmax(fit.info.channel_power(weights)))
         changed = fit.info.channel_power(fit.tests[out.name].change[None] @ weights)
         channel, ratio = CHANNELS[c], min(float(changed[c] / power[c]), 1.0)
-        if channel in best or out.name in varies or ratio < LITTLE_LEFT:
+        unconfirmed = out.gain_ci[0] <= 0.0  # on data held out, where it was judged on these
+        if channel in best or out.name in varies or ratio < LITTLE_LEFT or unconfirmed:
             continue
         if fit.tests[out.name].z > Z_EFFECT:
             best[channel] = verdict.Unexplained(channel, out.name, out.z, ratio)

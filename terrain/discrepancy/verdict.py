@@ -69,7 +69,8 @@ class Cause(NamedTuple):
     name: str
     aliases: tuple[str, ...]
     parameters: tuple[Value, ...]  #: values, over what the simulation has of them already
-    #: part of the square that it removes on data held out beside the others, where it acts; NaN of a candidate
+    #: part of the square that it removes on data held out beside the others, where it acts; NaN of a candidate that
+    #: was not judged there
     held_out_gain: float
     gain_ci: tuple[float, float]  #: its 95 % interval
     channels: tuple[str, ...]  #: where it shows, the clearest first

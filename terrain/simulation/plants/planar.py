@@ -437,7 +437,8 @@ def direction(speed_mps: float) -> float:
 def turned_wheels(encoder_mps: Array, p: Any, radius_m: float, dt: float) -> Array:
     """Return wheel speeds (n, wheels) from those of encoders on the motors: a dead zone, then backlash of the gears.
 
-    The wheel stays within the play about the motor, and moves by that part of the motor's step that carries it along.
+    The wheel stays within the play about the motor, and moves by that part of the motor's steps before and after a
+    sample that carries it along: of the last step alone it would lose half a step more at each reversal.
     """
     dead_mps, play_m = p.wheel_dead_zone_mps, p.drive_backlash_rad * radius_m
     if dead_mps == 0.0 and play_m <= 0.0:
@@ -448,11 +449,13 @@ def turned_wheels(encoder_mps: Array, p: Any, radius_m: float, dt: float) -> Arr
         for k in range(out.shape[0]):
             speed = out[k, i] + dead_mps * direction(out[k, i])
             out[k, i] = speed
-            if play_m > 0.0 and k > 0:
-                step = 0.5 * dt * (before + speed)
+            if play_m > 0.0:
+                step, coming = 0.5 * dt * (before + speed) if k > 0 else 0.0, dt * speed
                 now = min(max(ahead - step, -play_m), play_m)
-                if step != 0.0:
-                    out[k, i] *= (step + (now - ahead)) / step
+                after = min(max(now - coming, -play_m), play_m)
+                if coming != 0.0:
+                    carried = 1.0 + (after - now) / coming
+                    out[k, i] *= 0.5 * (carried + (1.0 + (now - ahead) / step if step != 0.0 else carried))
                 ahead = now
             before = speed
     return out

@@ -180,13 +180,14 @@ def test_names_of_answers_are_those_of_the_catalogue_or_of_what_it_lacks():
         (Answer(candidates=("scrub",)), Outcome.OTHER),
         (Answer(candidates=("scrub", "motor_constant")), Outcome.CANDIDATE),
         (Answer(candidates=("payload",), unexplained=("speed_x_mps",)), Outcome.UNEXPLAINED),
-        (Answer(unexplained=("current_a",)), Outcome.SILENT),  # known before anything was hidden
+        (Answer(unexplained=("current_a by speed",)), Outcome.SILENT),  # known before anything was hidden
+        (Answer(unexplained=("current_a by force",)), Outcome.UNEXPLAINED),
         (Answer(unexplained=("speed_x_mps",)), Outcome.UNEXPLAINED),
         (Answer(), Outcome.SILENT),
     ],
 )
 def test_an_answer_is_worth_what_the_physics_says(answer, outcome):
-    known, hidden = ("current_a",), {"payload_ratio": 0.4}
+    known, hidden = ("current_a by speed",), {"payload_ratio": 0.4}
     assert outcome_of(answer, ("payload",), ("motor_constant",), known, hidden) is outcome
 
 

@@ -1,7 +1,8 @@
 """One trial: a builder calibrates a robot's description by ``terrain explain``, something changes, and it is asked for.
 
 Whatever the world does otherwise than the nominal description is in the extended one before anything is hidden.  What
-that one still leaves unexplained where nothing is hidden is known to its builder: it is no answer to what is hidden.
+that one still leaves unexplained where nothing is hidden is known to its builder: it is no answer to what is hidden,
+but that a channel depends on something else than it did is.
 Where nothing is hidden it counts as stated all the same, and what is new beside it is counted apart.
 """
 
@@ -80,7 +81,7 @@ class Answer(NamedTuple):
     varying: tuple[str, ...] = ()
     faults: tuple[str, ...] = ()  #: sentences
     candidates: tuple[str, ...] = ()
-    unexplained: tuple[str, ...] = ()  #: channels
+    unexplained: tuple[str, ...] = ()  #: channels, with the input that each depends on where one is stated
     learned: tuple[str, ...] = ()  #: channels of learned terms that are new
     refusal: str = ""
 
@@ -102,7 +103,7 @@ class ForeignTrial:
     hidden: Mapping[
         str, float
     ]  #: values by parameter, beside the calibrated description, where the catalogue has them
-    known: tuple[str, ...]  #: channels and candidates that the calibrated description leaves
+    known: tuple[str, ...]  #: what the calibrated description leaves: channels with inputs, candidates
     answer: Answer
     outcome: Outcome
     seconds: float
@@ -138,7 +139,7 @@ def outcome_of(
     --------
     >>> outcome_of(Answer(causes=("payload", "scrub")), ("payload",), (), ())
     <Outcome.COMPANY: 'company'>
-    >>> outcome_of(Answer(unexplained=("current_a",)), ("payload",), (), ("current_a",))
+    >>> outcome_of(Answer(unexplained=("current_a by speed",)), ("payload",), (), ("current_a by speed",))
     <Outcome.SILENT: 'silent'>
     """
     good = {*right, *nearest}
@@ -189,12 +190,14 @@ def asked(runs: Sequence[RunLog], robot: Robot) -> tuple[Answer, Robot]:
         varying=tuple(each.name for each in diagnosis.varying),
         faults=tuple(fault.sentence for fault in diagnosis.faults),
         candidates=tuple(cause.name for cause in diagnosis.candidates),
-        unexplained=tuple(
-            dict.fromkeys(
+        unexplained=(
+            *(f"{each.channel} by {each.input}" for each in diagnosis.unexplained),
+            *(
                 each.channel
-                for each in (*diagnosis.unexplained, *diagnosis.channels)
-                if getattr(each, "tier", Tier.UNEXPLAINED) is Tier.UNEXPLAINED
-            )
+                for each in diagnosis.channels
+                if each.tier is Tier.UNEXPLAINED
+                and each.channel not in {left.channel for left in diagnosis.unexplained}
+            ),
         ),
         learned=tuple(term.channel for term in terms),
     ), found.extended

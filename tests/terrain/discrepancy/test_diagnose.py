@@ -181,11 +181,10 @@ def test_two_effects_are_named_beside_a_run_that_is_unfit_and_half_of_one_where_
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("robot", "half_rad"), [("husky", 0.15), ("adap2e", 0.2), ("marmotte", 0.1)])
-def test_backlash_of_the_drive_is_named_a_little_too_small(worlds, robot, half_rad):
-    """The common low-pass rounds the reversals off, which hides up to some hundredths of a radian of it."""
+def test_backlash_of_the_drive_is_named_with_its_size(worlds, robot, half_rad):
     diagnosis = diagnose(worlds(robot).runs({"drive_backlash_rad": half_rad}), worlds(robot).simulation)
     assert named(diagnosis) == ["drive_backlash"]
-    assert 0.85 * half_rad < diagnosis.values["drive_backlash_rad"] < half_rad
+    assert diagnosis.values["drive_backlash_rad"] == pytest.approx(half_rad, rel=0.1)
 
 
 @pytest.mark.slow
