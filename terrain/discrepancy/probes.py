@@ -27,7 +27,7 @@ RUN_RATIO = 2.0
 the residual depends on is then one more thing that differs from run to run (MacKinnon, Nielsen and Webb,
 Journal of Econometrics 2023)."""
 
-CRAWL_MPS = 0.2  #: Scale of speed of the probe of wheels that crawl
+CRAWL_MPS = 0.2  #: Scale of speed of the probes of crawling
 
 STANDSTILL_MPS = 0.05
 
@@ -60,8 +60,8 @@ def probe_inputs(rows: Rows, rate_hz: float) -> dict[str, Array]:
     accel, steering_rate = [np.zeros_like(x) if few else np.gradient(x) * rate_hz for x in (speed, steer)]
     tau = rows.time_s / 60.0 - 0.5
     direction = np.tanh(speed / STANDSTILL_MPS)
+    crawl = np.exp(-((speed / CRAWL_MPS) ** 2)) * np.abs(direction)
     sides = np.array([speed - 0.5 * turn, speed + 0.5 * turn])  # friction is of each wheel
-    crawl = np.exp(-((sides / CRAWL_MPS) ** 2)) * np.tanh(sides / STANDSTILL_MPS)
     return {
         "constant": np.ones_like(speed),
         "time": tau,
@@ -70,8 +70,9 @@ def probe_inputs(rows: Rows, rate_hz: float) -> dict[str, Array]:
         "|speed|": np.abs(speed),
         "speed |speed|": speed * np.abs(speed),
         "direction": direction,
-        "crawling": np.abs(crawl).mean(axis=0),
-        "crawling direction": crawl.mean(axis=0),
+        "crawling": crawl,
+        "crawling direction": crawl * direction,
+        "crawling wheels": (np.exp(-((sides / CRAWL_MPS) ** 2)) * np.tanh(sides / STANDSTILL_MPS)).mean(axis=0),
         "turn": turn,
         "|turn|": np.abs(turn),
         "turn |turn|": turn * np.abs(turn),
