@@ -72,7 +72,9 @@ def probe_inputs(rows: Rows, rate_hz: float) -> dict[str, Array]:
         "direction": direction,
         "crawling": crawl,
         "crawling direction": crawl * direction,
-        "crawling wheels": (np.exp(-((sides / CRAWL_MPS) ** 2)) * np.tanh(sides / STANDSTILL_MPS)).mean(axis=0),
+        "crawling wheels": (np.exp(-((sides / CRAWL_MPS) ** 2)) * np.tanh(sides / STANDSTILL_MPS)).mean(
+            axis=0
+        ),
         "turn": turn,
         "|turn|": np.abs(turn),
         "turn |turn|": turn * np.abs(turn),
