@@ -30,13 +30,11 @@ from terrain.discrepancy.powertrain import Powertrain
 from terrain.discrepancy.robot_terms import (
     in_robot_terms,
     limit_text,
-    quantity,
-    quantity_interval,
     value_in_robot_terms,
     values_with_intervals,
 )
 from terrain.discrepancy.runs import measured_channels
-from terrain.discrepancy.verdict import Cause, ChannelVerdict, Diagnosis, Tier
+from terrain.discrepancy.verdict import Cause, ChannelVerdict, Diagnosis, Tier, Value
 from terrain.effects import GYRO, HEADING, PARAMETER, effect_named
 from terrain.learned_term import LearnedTerm
 from terrain.robots import Robot
@@ -156,6 +154,7 @@ def report(result: ExplainResult) -> Report:
 
 # -- The first screen: one sentence, and the five questions that a reader comes with ------------------------
 
+BY = ", by the "
 BY_SENSOR = {GYRO: "gyro", HEADING: "poses"}  #: That measure the same motion
 
 STATED = 3  #: Channels, causes or candidates that an answer lists
@@ -210,9 +209,13 @@ def answer_of(result: ExplainResult) -> str:
 def five_questions(result: ExplainResult) -> Pairs:
     """Return what is wrong, why, how certain that is, what it gains, and what to do next."""
     diagnosis, channels = result.diagnosis, channels_that_matter(result)
-    wrong = [_off(result, of) for of in channels[:STATED]]
-    if more := [CHANNEL_WORDS[of.channel][0] for of in channels[STATED:]]:
-        wrong.append(f"less in {enumerated(more)}")
+    sensors: dict[str, list[str]] = {}  # of one error, which sensors show it
+    for of in channels[:STATED]:
+        what, _, sensor = _off(result, of).partition(BY)
+        sensors[what] = [*sensors.get(what, ()), *filter(None, [sensor])]
+    wrong = [f"{what}{f'{BY}{enumerated(by)}' if by else ''}" for what, by in sensors.items()]
+    if more := [f"{CHANNEL_WORDS[of.channel][0]} ({_rms(of)})" for of in channels[STATED:]]:
+        wrong.append(f"smaller errors: {enumerated(more)}")
     rows = [
         ("What is wrong", _sentences(wrong) or "Nothing that these runs show."),
         ("Why", _why(result)),
@@ -231,7 +234,7 @@ def _gains(result: ExplainResult) -> str:
         if first.gain > 0.0 and len(result.diagnosis.channels) > 1:
             interval = f"{percent_text(first.gain_ci[0], '')} to {percent_text(first.gain_ci[1])}"
             of = f"the squared error of the {CHANNEL_WORDS[first.channel][0]}"
-            parts.append(f"it removes {percent_text(first.gain)} ({interval}) of {of}")
+            parts.append(f"what is built in removes {percent_text(first.gain)} ({interval}) of {of}")
     if math.isfinite(names.reduction):
         refused = ", which may be nothing" if names.refused else ""
         interval = f"{percent_text(names.ci[0], '')} to {percent_text(names.ci[1])}"
@@ -241,8 +244,11 @@ def _gains(result: ExplainResult) -> str:
     if whole.reduction > (names.reduction if math.isfinite(names.reduction) else 0.0):
         beside = "with the learned terms" if math.isfinite(names.reduction) else "learned terms remove"
         parts.append(f"{beside} {percent_text(whole.reduction)}")
-    parts.append(f"a black-box learner removes {percent_text(names.learner_reduction)}")
-    return f"On {names.how}: {'; '.join(parts)}."
+    low, high = (percent_text(end) for end in names.learner_ci)
+    parts.append(
+        f"a black-box learner would remove {percent_text(names.learner_reduction)} ({low} to {high})"
+    )
+    return f"Against the simulation as it is, on {names.how}: {'; '.join(parts)}."
 
 
 def _why(result: ExplainResult) -> str:
@@ -267,6 +273,11 @@ def _why(result: ExplainResult) -> str:
     return _sentences(parts) or "Nothing is to be explained."
 
 
+def _clear(cause: Cause) -> Sequence[Value]:
+    """Return the values of a cause whose interval is clear of 0, or all where none is."""
+    return [value for value in cause.parameters if value.low * value.high > 0.0] or cause.parameters
+
+
 def _learned_terms(result: ExplainResult) -> tuple[list[LearnedTerm], list[LearnedTerm]]:
     """Return the learned terms that are built in, and apart those that are no better on the runs held out."""
     no_better = {
@@ -282,7 +293,7 @@ def _how_certain(result: ExplainResult) -> str:
     for tier, words in ((Tier.NAMED, "confirmed on held-out runs"), (Tier.SET, "confirmed as one of a set")):
         values = [
             f"{effect_label(cause.name)} "
-            + enumerated([value_in_robot_terms(*v[:2], *v[3:], result.robot) for v in cause.parameters])
+            + enumerated([value_in_robot_terms(*v[:2], *v[3:], result.robot) for v in _clear(cause)])
             for cause in diagnosis.built_in
             if cause.tier is tier
         ]
@@ -323,10 +334,13 @@ def _off(result: ExplainResult, of: ChannelVerdict) -> str:
             if math.isfinite(ratio) or math.isfinite(level):
                 text = off_by(of.channel, ratio, level)
                 if of.channel in BY_SENSOR:
-                    return f"{text}, by the {BY_SENSOR[of.channel]}"
+                    return f"{text}{BY}{BY_SENSOR[of.channel]}"
                 return text.replace("simulated, it is", f"the simulated {CHANNEL_WORDS[of.channel][0]} is")
-    name, unit = CHANNEL_WORDS[of.channel]
-    return f"the simulated {name} is off by {of.rms_before:.2g} {unit} rms"
+    return f"the simulated {CHANNEL_WORDS[of.channel][0]} is off by {_rms(of)}"
+
+
+def _rms(of: ChannelVerdict) -> str:
+    return f"{of.rms_before:.2g} {CHANNEL_WORDS[of.channel][1]} rms"
 
 
 def _terms(cause: Cause, result: ExplainResult) -> str:
@@ -354,13 +368,16 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
     if diagnosis.excluded_runs:
         yield Text(f"Runs that were excluded as unfit: {_ids(diagnosis.excluded_runs)}.", "warning")
     causes: list[tuple[Any, ...]] = []
-    notes = ["Values are added to what the description has already."]
+    notes = [
+        "Of each cause the part of the squared error that it removes in the channels where it acts, on runs held out."
+    ]
     for cause in diagnosis.built_in:
         label = effect_label(cause.name)
         beside = cause.held_out_gain, cause.z, result.terms.get(cause.name, "")
         for value in cause.parameters:
             of = f"{label} ({PARAMETER[value.name].label})" if len(cause.parameters) > 1 else label
-            causes.append((of, quantity(value.name, value.value), quantity_interval(value), *beside))
+            at = value_in_robot_terms(value.name, value.value, value.low, value.high, result.robot)
+            causes.append((of, at, *beside))
         if cause.aliases:
             notes.append(
                 f"No log distinguishes {label} from {enumerated([*map(effect_label, cause.aliases)])}."
@@ -369,7 +386,7 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
             notes.append(f"{label}: {cause.caveat}.")
     if causes:
         gain, terms = Column("squared error removed", PERCENT), Column("the robot has", long=True)
-        heads = ("cause", "value", "95 %", gain, Column("z", Z), terms)
+        heads = ("cause", "value (95 %)", gain, Column("evidence, z", Z), terms)
         yield Table(heads, causes, note=" ".join(notes))
     for names in diagnosis.ambiguous_sets:
         yield _rivals(names, diagnosis)

@@ -267,7 +267,7 @@ def varying_text(effect: Varying, robot: Robot) -> str:
         )
     if effect.rivals:
         rivals = enumerated([effect_label(rival) for rival in effect.rivals], "or")
-        text += f" These runs do not distinguish that from {rivals}."
+        text += f" It may as well be {rivals} that differs."
     return text
 
 

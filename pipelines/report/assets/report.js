@@ -150,7 +150,7 @@
       values: (u, splits) => splits.map(written), filter: (u, splits) => splits });
     const u = new uPlot({
       width, height, series, axes, title: panel.title || ((thin || first) && label) || undefined,
-      legend: { show: thin ? last : series.length > 2 || !panel.y_label, live: !categories && !thin },
+      legend: { show: thin ? last : series.length > 2 || !panel.y_label, live: !categories && !thin && !first },
       cursor: { sync: { key: group.key }, drag: { x: true, y: !categories, uni: 40, setScale: false },
         bind: { dblclick: () => () => { zoom.x = null; zoomY.y = null; group.redraw(); return null; } } },
       scales: {
