@@ -244,7 +244,7 @@ def _gains(result: ExplainResult) -> str:
     if whole.reduction > (names.reduction if math.isfinite(names.reduction) else 0.0):
         beside = "with the learned terms" if math.isfinite(names.reduction) else "learned terms remove"
         parts.append(f"{beside} {percent_text(whole.reduction)}")
-    low, high = (percent_text(end) for end in names.learner_ci)
+    low, high = percent_text(names.learner_ci[0], ""), percent_text(names.learner_ci[1])
     parts.append(
         f"a black-box learner would remove {percent_text(names.learner_reduction)} ({low} to {high})"
     )

@@ -90,8 +90,8 @@ def test_the_first_screen_answers_what_why_how_certain_what_for_and_what_next(ex
         "Why The measured point 0.45 m ahead and 0.05 m right of the centre",
         "How certain Confirmed on held-out runs, with 95 % intervals: lever arm 0.45 m (0.44 to 0.46) and -50 mm "
         "(-60 to -40 mm)",
-        "What it gains On 2 runs held out: over all channels named causes remove 50 % (40 to 60 %); a black-box "
-        "learner removes 76 %",
+        "What it gains Against the simulation as it is, on 2 runs held out: over all channels named causes remove 50 % "
+        "(40 to 60 %); a black-box learner would remove 76 % (70 to 80 %)",
         "What next Simulate and estimate with extended.yaml in place of the robot's file",
         "lever arm (lever x) 0.45 m (0.44 to 0.46) 40.0 % 9.0",
         "No log distinguishes lever arm from an alias.",
