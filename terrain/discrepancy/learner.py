@@ -12,8 +12,8 @@ least squares: Chen, Billings and Luo, Int. J. Control 1989).  How many there ar
 sessions, or runs where there are few: the fewest whose error is within one standard error of the least (Breiman et
 al., Classification and Regression Trees, 1984, 3.4.3), or as many as have the least where the fewest do not reach
 :data:`ENOUGH` of the black-box reference.  None is the answer where none is within it, where none gains clearly, or
-where two sessions are there and the term of each does not gain in the other.  Runs held out decide
-nothing of a term.
+where less than :data:`ENOUGH` of that gain is left with larger parts left out, each session where there are two.  Runs
+held out decide nothing of a term.
 """
 
 from __future__ import annotations
@@ -106,7 +106,8 @@ def _regressors(run: ComparedRun) -> Array:
 
 # -- Terms that are learned -------------------------------------------------------------------------------------
 
-#: Part of the black-box reference's gain that few products have to reach, to be preferred to more.
+#: Part of the black-box reference's gain that few products have to reach, to be preferred to more, and of the gain on
+#: single groups left out that they have to have on larger parts: what holds in one of two sessions is no law of both.
 ENOUGH = 0.9
 MAX_PRODUCTS = 30  #: Products of a term; the black-box reference has some eighty.
 #: Groups of runs, or sessions, of the cross-validation; with fewer nothing is learned.
@@ -198,9 +199,8 @@ def learn_terms(
         errors = cross_validated(sums)
         reference = float(references[c])
         n = size_of(errors, (1.0 - ENOUGH) * before + ENOUGH * reference)
-        by_chance = CHANCE / len(runs) * float(scatter[c])
-        n = n if errors[:, 0].sum() - errors[:, n].sum() > by_chance else 0
-        n = n if left_out_gain(np.array(grams), folds, n) > 0.0 else 0
+        by_chance, gained = CHANCE / len(runs) * float(scatter[c]), errors[:, 0].sum() - errors[:, n].sum()
+        n = n if gained > by_chance and left_out_gain(np.array(grams), folds, n) >= ENOUGH * gained else 0
         term, left_out = None, {}
         if n:
             total = sums.sum(axis=0)

@@ -240,10 +240,10 @@ def test_figures_show_the_residual_before_and_after_with_the_band_about_the_exte
 
 def test_the_study_of_measured_sets_states_gains_and_coverage_of_runs_held_out_alone(few):
     """The gain with terms is that of the names where none is learned."""
-    rows = whole_rows("a set", "none", few.diagnosed)
+    rows = whole_rows("a set", "none", [few.diagnosed] * 2)
     assert not few.diagnosed.learned or [row.channel for row in rows][-1] == "all"
     for row in rows:
         assert row.gain == pytest.approx(row.named_gain) or row.says
         assert row.channel == "all" or row.coverage > 0.8
-    for row in whole_rows("a set", "none", replace(few.diagnosed, whole=())):
+    for row in whole_rows("a set", "none", [replace(few.diagnosed, whole=())]):
         assert np.isnan(row.coverage)
