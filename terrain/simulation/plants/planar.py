@@ -672,6 +672,9 @@ BICYCLE = PlanarDrive(
 # Speed below which slip is no more over the speed itself, and over which a resistance takes its full size; assumed:
 # a fifth of the slowest measured drive.
 ROLLING_MPS = 0.02
+# Speed of a wheel over which its motor's dry friction takes its full size: about a tick of an encoder in a sample, as a
+# wheel that hardly turns, of a robot that drives nearly along its axle, draws what the others do.
+TURNING_MPS = 0.004
 # Slip per traction that an effect leaves of the ground's own at the least, and that of the stiffest.
 STIFFEST, STIFFEST_GROUND = 0.1, 1e-6
 # Implicit steps within one of the simulation, so that their lag, half of each, is about a millisecond.
@@ -822,7 +825,7 @@ def currents_of(params: Array, vector: Array, dt: float, wheel_speed_mps: Array,
             turns = _dot(across[i], twist) + u[i] * rollers.sine[i]
             pull += load[i] * friction * weight / speed * turns * rollers.sine[i]
             torque = (pull + body.rotating_kg / wheels * spun[k, i]) * radius_m
-            direction = u[i] / math.sqrt(u[i] * u[i] + ROLLING_MPS * ROLLING_MPS)
+            direction = u[i] / math.sqrt(u[i] * u[i] + TURNING_MPS * TURNING_MPS)
             out[k, i] = (torque + body.friction_nm / wheels * direction) / body.nm_per_a
     return out
 

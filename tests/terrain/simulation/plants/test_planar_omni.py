@@ -15,6 +15,7 @@ from terrain.robots import load_robot
 from terrain.simulation.plants.planar import (
     ROLLING_MPS,
     SUBSTEPS,
+    TURNING_MPS,
     Ground,
     currents_of,
     make_planar,
@@ -112,7 +113,7 @@ def test_currents_are_those_of_friction_where_nothing_resists_and_grow_with_the_
     planar = make_planar(centred(ROBOT), CARPET._replace(roller_ratio=0.0))
     wheels = wheels_for((0.3, 0.1, 0.0))
     free = moved(centred(ROBOT), CARPET._replace(roller_ratio=0.0), wheels)
-    direction = wheels[-1] / np.hypot(wheels[-1], ROLLING_MPS)
+    direction = wheels[-1] / np.hypot(wheels[-1], TURNING_MPS)
     motors = ROBOT.motors
     per_a = motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
     each = currents_of(planar.params, NONE, DT, wheels, free)[-1]
