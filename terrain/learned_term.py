@@ -278,20 +278,17 @@ class LearnedTerm:
         return added, np.sqrt(np.maximum(variance, 0.0))
 
 
-def add_terms(terms: Sequence[LearnedTerm], inputs: Array, dt: float, truth: Array, motion: bool) -> None:
-    """Add terms to the motion of a body, or to what is read of it.
+def add_terms(terms: Sequence[LearnedTerm], inputs: Array, dt: float, truth: Array) -> None:
+    """Add terms to what they are of: the motion of a body, or what is read of it.
 
     Parameters
     ----------
     inputs : (n, len(INPUTS))
     dt : step in s
     truth : (n,) of :data:`terrain.simulation.plants.planar.TRUTH`, changed in place
-    motion : whether those of :data:`MOTION` are added, or those of the other channels
     """
-    if not (acting := [term for term in terms if (term.channel in MOTION) == motion]):
-        return
     dt_s = np.full(len(inputs), dt)
-    for term in acting:
+    for term in terms:
         truth[FIELDS.get(term.channel, term.channel)] += term.predict(inputs, dt_s)[0]
 
 

@@ -11,10 +11,11 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 from operator import attrgetter
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -55,11 +56,14 @@ from terrain.simulation.plants.planar import (
     TRUTH,
     Ground,
     Planar,
+    PlanarDrive,
     corrected_inputs,
     delayed,
     lateness,
+    learned_motion,
     make_planar,
     move,
+    moved_by,
     planar_ground,
     replay,
     sense,
@@ -177,7 +181,7 @@ IMU_AXES = tuple(
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class Signals:
     """A run on one clock."""
 
@@ -516,7 +520,8 @@ class Rows(NamedTuple):
     time_s: Array  #: (m,) from the start of the run
     measured: Array  #: (m, channels)
     predicted: Array
-    sensitivity: Array  #: (parameters, m, channels) change of the prediction per change of each parameter
+    #: (parameters, m, channels) change of the prediction per change of each parameter; 0 in channels without measurements
+    sensitivity: Array
     inputs: Array  #: (m, len(INPUTS) - 1 + wheels) inputs of the simulation, for probes of the residual
 
     @property
@@ -595,50 +600,142 @@ def rows_of(
         acts = [name in names or signals.is_second for name in parameters]
         sensitivity = rows.sensitivity[[names.index(in_common(name)) for name in parameters]]
         return rows._replace(sensitivity=sensitivity * np.reshape(acts, (-1, 1, 1)))
+    run, window = _prepared(signals, planar, low_pass), (low_pass.taps, low_pass.every)
+    dt, tilt = run.dt, (run.steer, run.grade, run.roll)
+    now = replay(planar, vector, dt, run.wheel_speed, *tilt)
+    speed, *slope = corrected_inputs(planar.body, vector, dt, run.instruments, *tilt[1:])
+    truth = move(planar, vector, dt, speed, run.steer, *slope)
+    measuring = {CHANNELS[c] for c in run.shown}
+    acts = [not measuring.isdisjoint(SHOWS.get(name, CHANNELS)) for name in parameters]
+    acting = [name for name, shows in zip(parameters, acts, strict=True) if shows]
+    points, each = np.tile(vector, (2, len(acting), 1)), range(len(acting))  # ahead and back
+    at, steps = [INDEX[name] for name in acting], np.array([STEPS[name] for name in acting])
+    points[0, each, at] += steps
+    both_sided = [name not in ONE_SIDED or vector[INDEX[name]] >= STEPS[name] for name in acting]
+    points[1, each, at] -= steps * both_sided
+    change = np.zeros((len(parameters), len(run.time_s), len(CHANNELS)))
+    change[np.ix_(acts, range(len(run.time_s)), run.shown)] = _differences_by(planar.drive)(
+        planar.params,
+        planar.body,
+        points,
+        points[0, each, at] - points[1, each, at],
+        np.array([name in SENSED_ONLY for name in acting], dtype=np.bool_),
+        dt,
+        (run.instruments, *tilt),
+        truth,
+        _learned(planar, points, dt, run.instruments, *tilt),
+        run.shown,
+        run.holes[:, run.shown] if run.holes.size else run.holes,
+        (run.first, run.last, *window),
+    )
+    force = truth["force_n"] / (GRAVITY_MPS2 * planar.robot.mass_kg)
+    inputs, inside = run.inputs.copy(), slice(run.first, run.last)
+    inputs[:, INPUTS.index("force_ratio")] = decimate(force[inside, None], run.holes[:, :0], *window)[:, 0]
+    now = decimate(now[inside], run.holes[inside], *window)
+    return Rows(signals.run_id, signals.terrain, run.time_s, run.measured, now, change, inputs)
+
+
+def _learned(
+    planar: Planar, points: Array, dt: float, wheel_speed: Array, steer: Array, *tilt: Array
+) -> Array:
+    """Return what learned terms add (2, k, n) at points (2, k, len(PARAMETERS)); (2, k, 0) without any."""
+    added = np.zeros((*points.shape[:2], len(steer) if planar.learned else 0), TRUTH)
+    for place in np.ndindex(points.shape[:2] if planar.learned else (0,)):
+        speed, *slope = corrected_inputs(planar.body, points[place], dt, wheel_speed, *tilt)
+        added[place] = learned_motion(planar, dt, speed, steer, *slope)
+    return added
+
+
+@cache
+def _differences_by(drive: PlanarDrive) -> Any:
+    """Return the kernel of the sensitivities of a drive: replays ahead and back behind the low-pass, their difference.
+
+    It takes no lock of Python's, so that runs are replayed at the same time.
+    """
+    moved = moved_by(drive)
+
+    @njit(nogil=True)
+    def differences(
+        params: Array,
+        body: Array,
+        points: Array,
+        apart: Array,
+        sensed_only: Array,
+        dt: float,
+        inputs: tuple[Array, Array, Array, Array],
+        truth: Array,
+        added: Array,
+        shown: Array,
+        holes: Array,
+        window: tuple[int, int, Array, int],
+    ) -> Array:
+        wheel_speed, steer, grade, roll = inputs
+        first, last, taps, every = window
+        n_rows = max((last - first - taps.size) // every + 1, 0)
+        change = np.zeros((apart.size, n_rows, shown.size))
+        values, known = np.empty((last - first, shown.size)), np.ascontiguousarray(holes[first:last])
+        for j in range(apart.size):
+            for side in range(2):
+                vector, motion = points[side, j], truth
+                if not sensed_only[j]:
+                    speed, uphill, left_up = corrected_inputs(body, vector, dt, wheel_speed, grade, roll)
+                    driven = speed, steer, uphill, left_up, np.zeros((0, 3))
+                    motion = moved(params, vector, dt, driven, added[side, j])
+                seen = sense(body, vector, dt, motion)
+                for c in range(shown.size):
+                    values[:, c] = seen[first:last, shown[c]]
+                change[j] += (1.0 - 2.0 * side) * decimate(values, known, taps, every)
+            change[j] /= apart[j]
+        return change
+
+    return differences
+
+
+class Prepared(NamedTuple):
+    """A run behind the window of the inputs, and those of its rows that no parameter changes."""
+
+    dt: float  #: period of the replay's clock
+    wheel_speed: Array  #: (n, wheels) on it, and as instruments
+    instruments: Array
+    steer: Array  #: (n, wheels)
+    grade: Array  #: (n,)
+    roll: Array
+    shown: Array  #: places of the channels that are measured
+    holes: Array  #: (n, channels) where these are known; (n, 0) where there are no holes
+    first: int  #: samples behind the rows that are kept, and the end
+    last: int
+    time_s: Array  #: as :class:`Rows` has them, the inputs without force
+    measured: Array
+    inputs: Array
+
+
+_PREPARED: WeakKeyDictionary[Signals, tuple[Any, Prepared]] = WeakKeyDictionary()
+
+
+def _prepared(signals: Signals, planar: Planar, low_pass: LowPass) -> Prepared:
+    """Return a run as it is replayed, prepared once for a low-pass and a robot."""
+    key = *low_pass[1:], planar.robot
+    if signals in _PREPARED and _PREPARED[signals][0] == key:
+        return _PREPARED[signals][1]
     dt, wheel_speed, steer, grade, roll, measured = prepare_inputs(signals, low_pass)
     n_rows, kept = _kept_rows(dt, wheel_speed, steer, low_pass)
-    known = np.isfinite(measured)
-    holes = known[:, :0] if known[:, known.any(axis=0)].all() else known
-    window = low_pass.taps, low_pass.every
+    known, taps, every = np.isfinite(measured), low_pass.taps, low_pass.every
+    shown = np.flatnonzero(known.any(axis=0))
+    holes = known[:, :0] if known[:, shown].all() else known
     instruments = wheel_speed
     if math.isfinite(low_pass.instrument_cutoff_hz):
         instruments = _decimated(wheel_speed, _window(low_pass.instrument_cutoff_hz, 1.0 / dt), 1)
-    true_wheel_speed, true_grade, true_roll = corrected_inputs(
-        planar.body, vector, dt, instruments, grade, roll
-    )
-    truth = move(planar, vector, dt, true_wheel_speed, steer, true_grade, true_roll)
-
-    def predicted(point: Array, speeds: Array, only_sensed: bool) -> Array:
-        """Return the low-pass filtered prediction (rows, channels); the motion stays where only sensors change."""
-        seen = (
-            sense(planar.body, point, dt, truth)
-            if only_sensed
-            else replay(planar, point, dt, speeds, *inputs)
-        )
-        return np.asarray(decimate(seen, holes, *window))[kept]
-
-    inputs = steer, grade, roll
-    now = predicted(vector, wheel_speed, False)
-    change = np.empty((len(parameters), *now.shape))
-    measuring = {CHANNELS[c] for c in np.flatnonzero(known.any(axis=0))}
-    for j, name in enumerate(parameters):
-        if name in SHOWS and measuring.isdisjoint(SHOWS[name]):  # nothing measured shows it
-            change[j] = 0.0
-            continue
-        i, (ahead, back) = INDEX[name], np.tile(vector, (2, 1))
-        ahead[i] += STEPS[name]
-        if name not in ONE_SIDED or vector[i] >= STEPS[name]:
-            back[i] -= STEPS[name]
-        here, there = (predicted(point, instruments, name in SENSED_ONLY) for point in (ahead, back))
-        change[j] = (here - there) / (ahead[i] - back[i])
     speed, turn, sideways = _rolled(planar, instruments, steer)
-    force = truth["force_n"] / (GRAVITY_MPS2 * planar.robot.mass_kg)
-    driven = np.column_stack([speed, turn, steer.mean(axis=1), grade, roll, force, sideways])
+    driven = np.column_stack([speed, turn, steer.mean(axis=1), grade, roll, np.zeros_like(speed), sideways])
     phase = np.cumsum(instruments, axis=0) * (dt / planar.robot.wheel_radius_m)
-    at = low_pass.taps.size // 2 + low_pass.every * np.arange(n_rows)[kept]
-    shown = decimate(np.ascontiguousarray(measured), holes, *window)[kept]
-    driven = np.column_stack([decimate(driven, known[:, :0], *window)[kept], phase[at]])
-    return Rows(signals.run_id, signals.terrain, at * dt, shown, now, change, driven)
+    at = taps.size // 2 + every * np.arange(n_rows)[kept]
+    filtered = decimate(np.ascontiguousarray(measured), holes, taps, every)[kept]
+    inputs = np.column_stack([decimate(driven, known[:, :0], taps, every)[kept], phase[at]])
+    first, last = kept.start * every, (kept.stop - 1) * every + taps.size
+    of_rows = first, max(first, last if len(at) else 0), at * dt, filtered, inputs
+    run = Prepared(dt, wheel_speed, instruments, steer, grade, roll, shown, holes, *of_rows)
+    _PREPARED[signals] = key, run
+    return run
 
 
 def _kept_rows(dt: float, wheel_speed: Array, steer: Array, low_pass: LowPass) -> tuple[int, slice]:

@@ -512,7 +512,7 @@ def slip_along(
     return speed, rest, slips
 
 
-@njit
+@inner
 def _move_skid(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array:
     wheel_speed_mps, _steer_rad, grade_rad, _roll_rad, disturbance = inputs
     body, p, n = params[0].body, vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
@@ -587,7 +587,7 @@ _AXLES = "wheelbase_m com_ahead_m front_cornering_npr rear_cornering_npr yaw_ine
 AXLES = record({"body": PLANAR_BODY} | numbers(_AXLES) | {"front_driven": bool})
 
 
-@njit
+@inner
 def _move_bicycle(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array:
     """Return motion and traction: the last wheel is the rear one, the first, with its angle, the front one."""
     wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance = inputs
@@ -713,7 +713,7 @@ def _omni_numbers(robot: Robot, ground: Ground) -> dict[str, Any]:
     }
 
 
-@njit
+@inner
 def _move_omni(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array:
     """Return motion and net traction along x; the current is the sum of the magnitudes of :func:`currents_of`."""
     wheel_speed_mps, _steer_rad, grade_rad, roll_rad, disturbance = inputs
@@ -928,7 +928,7 @@ def _swerve_numbers(robot: Robot, ground: Ground) -> dict[str, Any]:
     }
 
 
-@njit
+@inner
 def _move_swerve(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array:
     wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance = inputs
     contact, p, n = params[0], vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
@@ -1132,28 +1132,59 @@ def move(
     disturbance : (n, 3) what the ground adds to speeds (shares of ``|u|``, along and across) and yaw rate (rad/s), or
         none: (0, 3)
     """
+    added = learned_motion(planar, dt, wheel_speed_mps, steer_rad, grade_rad, roll_rad)
     inputs = wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance
-    truth = planar.drive.move(planar.params, vector, dt, inputs)
-    if not planar.learned:
-        _finish(planar.body, vector, dt, inputs, planar.drive.drifts, truth)
+    return np.asarray(moved_by(planar.drive)(planar.params, vector, dt, inputs, added))
+
+
+def learned_motion(
+    planar: Planar, dt: float, wheel_speed_mps: Array, steer_rad: Array, grade_rad: Array, roll_rad: Array
+) -> Array:
+    """Return what learned terms add to each field (n,) of what the body does; (0,) without any."""
+    added: Array = np.zeros(len(grade_rad) if planar.learned else 0, TRUTH)
+    if planar.learned:
+        rolled = rolled_twist(planar.robot, wheel_speed_mps, steer_rad)
+        add_terms(planar.learned, np.column_stack([rolled, grade_rad, roll_rad]), dt, added)
+    return added
+
+
+@cache
+def moved_by(drive: PlanarDrive) -> Any:
+    """Return the kernel of all that a drive does: what its wheels, learned terms, side hill and ground make of it.
+
+    It is called from compiled code, too, as ``moved(params, vector, dt, inputs, added)``; see :func:`move`.
+    """
+    by_wheels, drifts = drive.move, drive.drifts
+
+    @njit
+    def moved(params: Array, vector: Array, dt: float, inputs: Inputs, added: Array) -> Array:
+        truth = by_wheels(params, vector, dt, inputs)
+        _finish(params[0].body, vector, dt, inputs, drifts, added, truth)
         return truth
-    rolled = np.column_stack([rolled_twist(planar.robot, wheel_speed_mps, steer_rad), grade_rad, roll_rad])
-    add_terms(planar.learned, rolled, dt, truth, motion=True)
-    _finish(planar.body, vector, dt, inputs, planar.drive.drifts, truth)
-    add_terms(planar.learned, rolled, dt, truth, motion=False)
-    return truth
+
+    return moved
 
 
-@njit
-def _finish(params: Array, vector: Array, dt: float, inputs: Inputs, drifts: bool, truth: Array) -> None:
-    """Add what side hill and ground do to the motion, and the specific force along x."""
-    p, effective_ratio = vector.view(EFFECTS)[0], params[0].effective_ratio
+@inner
+def _finish(
+    body: Any, vector: Array, dt: float, inputs: Inputs, drifts: bool, added: Array, truth: Array
+) -> None:
+    """Add learned terms, what side hill and ground do to the motion, and the specific force along x."""
+    p = vector.view(EFFECTS)[0]
     _, _, grade_rad, roll_rad, disturbance = inputs
+    for k in range(added.shape[0]):
+        row = truth[k]
+        row.speed_x_mps += added[k].speed_x_mps
+        row.speed_y_mps += added[k].speed_y_mps
+        row.yaw_rate_radps += added[k].yaw_rate_radps
+        row.gyro_error_radps += added[k].gyro_error_radps
+        row.current_a += added[k].current_a
+        row.turning_current_a += added[k].turning_current_a
     for k in range(truth.shape[0]):
         row = truth[k]
         fast = math.sqrt(row.speed_x_mps * row.speed_x_mps + row.speed_y_mps * row.speed_y_mps)
         if drifts:
-            row.speed_y_mps -= p.side_hill_slip_ratio * effective_ratio * roll_rad[k] * fast
+            row.speed_y_mps -= p.side_hill_slip_ratio * body.effective_ratio * roll_rad[k] * fast
         if disturbance.shape[0] > 0:
             row.speed_y_mps += fast * disturbance[k, 1]
             row.yaw_rate_radps += disturbance[k, 2]
@@ -1162,6 +1193,8 @@ def _finish(params: Array, vector: Array, dt: float, inputs: Inputs, drifts: boo
         row = truth[k]
         row.accel_x_mps2 = accel[k] - row.yaw_rate_radps * row.speed_y_mps
         row.accel_x_mps2 += GRAVITY_MPS2 * math.sin(grade_rad[k])
+        if added.shape[0] > 0:
+            row.accel_x_mps2 += added[k].accel_x_mps2
 
 
 def replay(
