@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +26,7 @@ from scipy.stats import chi2
 from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.discrepancy.differences import BOUNDS, INDEX, in_common
 from terrain.discrepancy.noise import ORDER, ORDERS, WHITE, Noise, noise_of, whiten
-from terrain.discrepancy.runs import LowPass, Rows, Signals, Simulation, rows_of
+from terrain.discrepancy.runs import LowPass, Rows, Signals, Simulation, of_each, rows_of
 from terrain.effects import CHANNELS, Effect
 from terrain.records import Array
 
@@ -218,17 +218,19 @@ def evidence_at(
     assumed = {n: std for n, std in (simulation.scatter if scatter is None else scatter).items() if std > 0}
     names, own = tuple(dict.fromkeys([*parameters, *assumed])), own or {}
     at, columns = [INDEX[name] for name in own], [names.index(name) for name in own]
-    rows = []
-    for i, run in enumerate(signals):
-        there = vector.copy()
+
+    def counted(i: int) -> Rows:
+        run, there = signals[i], vector.copy()
         there[at] = [values[i] for values in own.values()]
         run_rows = rows_of(run, planar[run.terrain], there, names, low_pass)
         back = np.tensordot(vector[at] - there[at], run_rows.sensitivity[columns], axes=1)
-        rows.append(run_rows._replace(predicted=run_rows.predicted + back))
+        return run_rows._replace(predicted=run_rows.predicted + back)
+
+    rows = of_each(counted, range(len(signals)))
     model_std = np.array([simulation.model_error.get(name, 0.0) for name in names])
 
     def whitened(noise: Noise, scatter: Mapping[str, float]) -> Evidence:
-        white = tuple([whiten_run(noise, run) for run in rows])
+        white = tuple(of_each(partial(whiten_run, noise), rows))
         grams = np.array([grams_of(columns) for columns in white])
         return Evidence(names, vector, vector, grams, scatter, tuple(rows), noise, white, model_std, session)
 

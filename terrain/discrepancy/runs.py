@@ -8,13 +8,15 @@ prediction contains the noise of a differentiated encoder, which otherwise looks
 from __future__ import annotations
 
 import math
+import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import pairwise
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -478,6 +480,7 @@ def _resample(time_s: Array, stamps_s: Array, values: Array) -> Array:
 
 #: Cut-off of the common low-pass at the full clock; commands of a wheeled robot change within 2 Hz.
 CUTOFF_HZ = 2.5
+N_THREADS = 2  #: Runs that are replayed at a time
 INPUT_CUTOFFS = 2.4  #: Cut-off of the inputs of the simulation, over that of the common low-pass.
 #: Cut-off of the wheel speeds that serve as instruments of the sensitivities, over that of the common low-pass: see
 #: :func:`rows_of`.
@@ -512,6 +515,10 @@ class LowPass(NamedTuple):
     instrument_cutoff_hz: float
 
 
+T = TypeVar("T")
+R = TypeVar("R")
+
+
 class Rows(NamedTuple):
     """A low-pass filtered run, row by row."""
 
@@ -520,7 +527,7 @@ class Rows(NamedTuple):
     time_s: Array  #: (m,) from the start of the run
     measured: Array  #: (m, channels)
     predicted: Array
-    #: (parameters, m, channels) change of the prediction per change of each parameter; 0 in channels without measurements
+    #: (parameters, m, channels) change of the prediction per change of each parameter; 0 where none is measured
     sensitivity: Array
     inputs: Array  #: (m, len(INPUTS) - 1 + wheels) inputs of the simulation, for probes of the residual
 
@@ -613,26 +620,37 @@ def rows_of(
     points[0, each, at] += steps
     both_sided = [name not in ONE_SIDED or vector[INDEX[name]] >= STEPS[name] for name in acting]
     points[1, each, at] -= steps * both_sided
+    added = _learned(planar, points, dt, run.instruments, *tilt)
+    apart = points[0, each, at] - points[1, each, at]
+    sensed_only = np.array([name in SENSED_ONLY for name in acting], dtype=np.bool_)
+    plant, about = (planar.params, planar.body, dt), (run.shown, run.holes, run.first, run.last, *window)
     change = np.zeros((len(parameters), len(run.time_s), len(CHANNELS)))
-    change[np.ix_(acts, range(len(run.time_s)), run.shown)] = _differences_by(planar.drive)(
-        planar.params,
-        planar.body,
-        points,
-        points[0, each, at] - points[1, each, at],
-        np.array([name in SENSED_ONLY for name in acting], dtype=np.bool_),
-        dt,
-        (run.instruments, *tilt),
-        truth,
-        _learned(planar, points, dt, run.instruments, *tilt),
-        run.shown,
-        run.holes[:, run.shown] if run.holes.size else run.holes,
-        (run.first, run.last, *window),
+    change[acts] = _differences_by(planar.drive)(
+        plant, points, apart, sensed_only, (run.instruments, *tilt), truth, added, about
     )
     force = truth["force_n"] / (GRAVITY_MPS2 * planar.robot.mass_kg)
     inputs, inside = run.inputs.copy(), slice(run.first, run.last)
     inputs[:, INPUTS.index("force_ratio")] = decimate(force[inside, None], run.holes[:, :0], *window)[:, 0]
     now = decimate(now[inside], run.holes[inside], *window)
     return Rows(signals.run_id, signals.terrain, run.time_s, run.measured, now, change, inputs)
+
+
+def of_each(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
+    """Return a function of each of some runs, in their order; two are computed at a time where there are two cores.
+
+    What is compiled lets go of the lock of Python's; more threads would wait for what is not.
+    """
+    results: dict[int, R] = {}
+    places = iter(range(len(items)))
+
+    def compute(_: int) -> None:
+        for i in places:  # of all threads
+            results[i] = function(items[i])
+
+    n_threads = min(N_THREADS, os.cpu_count() or 1, len(items))
+    with ThreadPoolExecutor(max(n_threads, 1)) as threads:
+        list(threads.map(compute, range(n_threads)))
+    return [results[i] for i in range(len(items))]
 
 
 def _learned(
@@ -656,24 +674,16 @@ def _differences_by(drive: PlanarDrive) -> Any:
 
     @njit(nogil=True)
     def differences(
-        params: Array,
-        body: Array,
-        points: Array,
-        apart: Array,
-        sensed_only: Array,
-        dt: float,
-        inputs: tuple[Array, Array, Array, Array],
-        truth: Array,
-        added: Array,
-        shown: Array,
-        holes: Array,
-        window: tuple[int, int, Array, int],
+        plant: Any, points: Any, apart: Any, sensed_only: Any, inputs: Any, truth: Any, added: Any, about: Any
     ) -> Array:
-        wheel_speed, steer, grade, roll = inputs
-        first, last, taps, every = window
+        (params, body, dt), (wheel_speed, steer, grade, roll) = plant, inputs
+        shown, holes, first, last, taps, every = about
         n_rows = max((last - first - taps.size) // every + 1, 0)
-        change = np.zeros((apart.size, n_rows, shown.size))
-        values, known = np.empty((last - first, shown.size)), np.ascontiguousarray(holes[first:last])
+        change = np.zeros((apart.size, n_rows, len(CHANNELS)))
+        values = np.empty((last - first, shown.size))
+        known = np.empty((last - first, min(shown.size, holes.shape[1])), np.bool_)
+        for c in range(known.shape[1]):
+            known[:, c] = holes[first:last, shown[c]]
         for j in range(apart.size):
             for side in range(2):
                 vector, motion = points[side, j], truth
@@ -684,7 +694,9 @@ def _differences_by(drive: PlanarDrive) -> Any:
                 seen = sense(body, vector, dt, motion)
                 for c in range(shown.size):
                     values[:, c] = seen[first:last, shown[c]]
-                change[j] += (1.0 - 2.0 * side) * decimate(values, known, taps, every)
+                rows = decimate(values, known, taps, every)
+                for c in range(shown.size):
+                    change[j, :, shown[c]] += (1.0 - 2.0 * side) * rows[:, c]
             change[j] /= apart[j]
         return change
 
@@ -709,14 +721,14 @@ class Prepared(NamedTuple):
     inputs: Array
 
 
-_PREPARED: WeakKeyDictionary[Signals, tuple[Any, Prepared]] = WeakKeyDictionary()
+_PREPARED: WeakKeyDictionary[Signals, tuple[Any, Robot | None, Prepared | None]] = WeakKeyDictionary()
 
 
 def _prepared(signals: Signals, planar: Planar, low_pass: LowPass) -> Prepared:
     """Return a run as it is replayed, prepared once for a low-pass and a robot."""
-    key = *low_pass[1:], planar.robot
-    if signals in _PREPARED and _PREPARED[signals][0] == key:
-        return _PREPARED[signals][1]
+    known_as, robot, run = _PREPARED.get(signals, ((), None, None))
+    if run is not None and known_as == low_pass[1:] and robot is planar.robot:
+        return run
     dt, wheel_speed, steer, grade, roll, measured = prepare_inputs(signals, low_pass)
     n_rows, kept = _kept_rows(dt, wheel_speed, steer, low_pass)
     known, taps, every = np.isfinite(measured), low_pass.taps, low_pass.every
@@ -734,7 +746,7 @@ def _prepared(signals: Signals, planar: Planar, low_pass: LowPass) -> Prepared:
     first, last = kept.start * every, (kept.stop - 1) * every + taps.size
     of_rows = first, max(first, last if len(at) else 0), at * dt, filtered, inputs
     run = Prepared(dt, wheel_speed, instruments, steer, grade, roll, shown, holes, *of_rows)
-    _PREPARED[signals] = key, run
+    _PREPARED[signals] = low_pass[1:], planar.robot, run
     return run
 
 

@@ -21,7 +21,7 @@ from terrain.discrepancy.evidence import (
     wald_test,
     whiten_run,
 )
-from terrain.discrepancy.runs import LowPass, Signals, Simulation, rows_of
+from terrain.discrepancy.runs import LowPass, Signals, Simulation, of_each, rows_of
 from terrain.effects import Effect
 from terrain.records import Array
 
@@ -82,18 +82,20 @@ class Problem(NamedTuple):
 
         Noise and scatter are those of the evidence given; it is much faster than the evidence there.
         """
-        k, white = len(names), []
-        total = np.zeros((1, 1, k + 1, k + 1))
+        k, total = len(names), np.zeros((1, 1, len(names) + 1, len(names) + 1))
         planar = {
             terrain: self.simulation.planar_on(terrain) for terrain in {r.terrain for r in self.signals}
         }
-        for run, around, inner in zip(self.signals, info.white, info.marginal[2], strict=True):
+
+        def whitened(run: Signals) -> Array:
             rows = rows_of(run, planar[run.terrain], vector, names, self.low_pass)
-            columns = whiten_run(info.noise, rows)
+            return whiten_run(info.noise, rows)
+
+        white = of_each(whitened, self.signals)
+        for columns, around, inner in zip(white, info.white, info.marginal[2], strict=True):
             flat = columns.reshape(k + 1, -1)
             along = around[info.nuisances].reshape(len(info.nuisances), flat.shape[1]) @ flat.T
             total += flat @ flat.T - along.T @ inner @ along
-            white.append(columns)
         return Evidence(tuple(names), vector, vector, total, {}, (), info.noise, tuple(white), np.zeros(k))
 
 
