@@ -480,7 +480,6 @@ def _resample(time_s: Array, stamps_s: Array, values: Array) -> Array:
 
 #: Cut-off of the common low-pass at the full clock; commands of a wheeled robot change within 2 Hz.
 CUTOFF_HZ = 2.5
-N_THREADS = 2  #: Runs that are replayed at a time
 INPUT_CUTOFFS = 2.4  #: Cut-off of the inputs of the simulation, over that of the common low-pass.
 #: Cut-off of the wheel speeds that serve as instruments of the sensitivities, over that of the common low-pass: see
 #: :func:`rows_of`.
@@ -643,13 +642,15 @@ def of_each(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
     results: dict[int, R] = {}
     places = iter(range(len(items)))
 
-    def compute(_: int) -> None:
+    def compute() -> None:
         for i in places:  # of all threads
             results[i] = function(items[i])
 
-    n_threads = min(N_THREADS, os.cpu_count() or 1, len(items))
-    with ThreadPoolExecutor(max(n_threads, 1)) as threads:
-        list(threads.map(compute, range(n_threads)))
+    with ThreadPoolExecutor(1) as threads:
+        others = [threads.submit(compute)] if min(os.cpu_count() or 1, len(items)) > 1 else []
+        compute()
+        for other in others:
+            other.result()
     return [results[i] for i in range(len(items))]
 
 
