@@ -108,11 +108,16 @@ def _factor(ratio: Array, units: Array) -> float:
     """Return half of the 95 % interval over the standard deviation, of residuals over that (m,) and their units (m,).
 
     It is the quantile over all rows, times that of Student's t over a normal one.  Its degrees of freedom are those of
-    the mean squares of units, as they scatter (Satterthwaite, Biometrics Bulletin 1946): many where each unit shows the
-    noise, as many as units where each has an offset of its own.
+    the mean squares of units, as they scatter (Satterthwaite, Biometrics Bulletin 1946), or of the level of each, one
+    number of a normal law: many where each unit shows the noise, as many as units where each has an offset of its own.
+    A few have no such quantile: it is drawn to the normal one as if one row beyond that had been seen.
     """
-    names, of = np.unique(units, return_inverse=True)
-    n, square = len(names), float(np.mean(ratio**2))
+    _, of, rows = np.unique(units, return_inverse=True, return_counts=True)
+    n, square, part = len(rows), float(np.mean(ratio**2)), rows / len(ratio)
     apart = np.bincount(of, weights=ratio**2 - square) / len(ratio)
-    freedom = max(2.0 * square**2 * (n - 1) / n / max(float(apart @ apart), TINY), 1.0)
-    return float(np.quantile(np.abs(ratio), COVERED) * student.ppf(TAIL, freedom) / ndtri(TAIL))
+    level = float(part @ (np.bincount(of, weights=ratio) / rows) ** 2)
+    scatter = max(n / (n - 1) * float(apart @ apart), 2.0 * level**2 * float(part @ part), TINY)
+    freedom, normal = max(2.0 * square**2 / scatter, 1.0), float(ndtri(TAIL))
+    known = freedom / (freedom + 1.0 / (1.0 - COVERED))
+    quantile = known * np.quantile(np.abs(ratio), COVERED) + (1.0 - known) * normal * np.sqrt(square)
+    return float(quantile * student.ppf(TAIL, freedom) / normal)

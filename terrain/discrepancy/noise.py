@@ -151,9 +151,7 @@ def whiten(filters: Array, x: Array) -> Array:
 
 
 TINY = 1e-30  #: A square of nothing, by which is divided
-LEAST_VARIANCE = (
-    0.02  #: Ratio of the mean square that a variance is at the least: rows at rest are not all of a fit
-)
+LEAST_VARIANCE = 0.02  #: Ratio of the mean square that a variance has at the least: rest is not all of a fit
 
 
 def growth_of(powers: Array, square: Array, n_fits: int, cut: float = np.inf) -> Array:
