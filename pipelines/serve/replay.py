@@ -141,6 +141,7 @@ class ReplayResult(Result, Replayed):
     runs: tuple[ReplayedRun, ...] = described("terrain, belief and windows of each run")
     skipped: tuple[str, ...] = described("a sentence for each run that could not be read")
     watch: str | None = described("extended robot that the runs were compared with", default=None)
+    watch_doubt: str = described("why alarms may come more often than asked for", default="")
     alarms: tuple[Alarm, ...] = described(
         "departures from it, in the order in which they were raised", default=()
     )
@@ -195,6 +196,7 @@ def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
         runs=tuple(runs),
         skipped=tuple(skipped),
         watch=None if settings.watch is None else str(settings.watch),
+        watch_doubt="" if watch is None else watch.watched.doubt,
         alarms=() if watch is None else tuple(watch.alarms),
         blocks=tuple(blocks),
     )
@@ -374,9 +376,8 @@ def _watched(result: ReplayResult) -> list[Part]:
     heads = ("run", Column("departure", long=True), Column("raised", ".1f", "s"), "over", "channel")
     parts: list[Part] = [Table(heads, rows)] if rows else []
     whys = Counter(block.why for block in result.blocks if block.why)
-    return parts + [
-        Text(f"{plural(n, 'block')} not compared: {why}", "note") for why, n in whys.most_common(3)
-    ]
+    parts += [Text(f"{plural(n, 'block')} not compared: {why}", "note") for why, n in whys.most_common(3)]
+    return [*parts, Text(result.watch_doubt, "note")] if result.watch_doubt else parts
 
 
 def _watch_figure(result: ReplayResult) -> Figure | None:

@@ -7,8 +7,8 @@ its model, and ``level = sum(r) / sqrt(n)``, of one that is off by an amount.  T
 one more channel.  The file of the model states by how much it is off in quiet runs, which is taken off the figure, and
 the variance of the figure in them, ``noise + scatter e``, where ``e = sum(p^2)``, of the level the sum of the squared
 wheel speed.  ``z`` is the figure over its standard deviation, and over ``sqrt(memory)``: its long-run variance (Newey
-and West 1987), as blocks that follow each other are alike, or rather the upper limit of it with 95 %.  It is cut off at
-:data:`CUT`, so that one rogue block is no alarm.
+and West 1987), as blocks that follow each other are alike, or rather the upper limit of it with 95 %, of a new session
+where there are several.  It is cut off at :data:`CUT`, so that one rogue block is no alarm.
 
 Each figure has two cumulative sums (Page 1954), ``S = max(0, S +- z - offset - k)``, and is an alarm from ``S >= h``
 until ``S = 0``; ``offset`` bounds the mean that ``z`` has in quiet driving: that of a new session with 95 %, by
@@ -72,6 +72,9 @@ LEAST_RATIO = 0.1  #: Of what is usual over the prediction, for a departure in p
 N_FITS = 10  #: Of the variance, each weighted by that of the one before.
 MEMORY_BLOCKS = 10  #: Longest memory of blocks.
 OTHER_CLOCK = 0.1  #: Ratio by which the clock may differ from that of the quiet runs.
+ONE_SESSION = (
+    "the usual deviations are those of one session: in others, alarms may come more often than asked for"
+)
 SCHEMA = 1  #: Version of the section that is read and written.
 KINDS = ("along", "level")
 
@@ -99,6 +102,7 @@ class BlockDeviation(NamedTuple):
     offset: float  #: largest mean of ``z`` that is usual
     least: float  #: ``e`` below which the block does not show the figure
     blocks: int  #: from which these are
+    sessions: int  #: of which these are; of one nothing tells how others differ
 
 
 class Block(NamedTuple):
@@ -186,6 +190,12 @@ class Watched:
     clock_hz: float  #: of the quiet runs
     deviations: Mapping[tuple[str, str], BlockDeviation]  #: by channel and kind
     source: str
+
+    @property
+    def doubt(self) -> str:
+        """Return why false alarms may come more often than is asked for; empty where there are several sessions."""
+        most = max([each.sessions for each in self.deviations.values()], default=0)
+        return "" if most > 1 else ONE_SESSION
 
     def threshold(self, false_alarm_h: float) -> dict[tuple[str, str], float]:
         """Return ``h`` of each figure, with one false alarm of all sums together in so many hours."""
@@ -334,22 +344,34 @@ def _deviation(blocks: Sequence[tuple[str, float, float, float]], kind: str) -> 
         means = np.bincount(places, z) / np.bincount(places)
         spread, memory = _memory(z - means[places], places)
     means /= math.sqrt(memory)
-    offset = abs(float(means[0])) + 2.0 / math.sqrt(n)  # of one session nothing tells how others differ
+    offset = abs(float(means[0])) + 2.0 / math.sqrt(n)
     if len(means) > 1:
         offset = float(student.ppf(0.975, len(means)) * np.sqrt(np.mean(means**2)))
-    return BlockDeviation(bias, float(growth[0]), float(growth[1]), memory, spread, offset, least, n)
+    return BlockDeviation(
+        bias, float(growth[0]), float(growth[1]), memory, spread, offset, least, n, len(means)
+    )
 
 
 def _memory(left: Array, places: Array) -> tuple[float, float]:
-    """Return variance and long-run variance (its upper limit) of deviations in order, of sessions by their places."""
+    """Return variance and long-run variance (its upper limit) of deviations in order, of sessions by their places.
+
+    Of several sessions the limit is that of a new one, by Student's law of the logarithms of their variances.
+    """
     n = len(left)
     spread = memory = float(left @ left) / (n - 1)
     lags = min(MEMORY_BLOCKS, n // 4)
     for lag in range(1, lags + 1):
         alike = places[lag:] == places[:-lag]
         memory += 2.0 * (1.0 - lag / (lags + 1)) * float((left[lag:] * left[:-lag] * alike).sum()) / (n - 1)
-    independent = n * min(spread / max(memory, spread), 1.0)
-    return spread, max(memory, spread) * independent / float(chi2.ppf(0.05, independent))
+    memory = max(memory, spread)
+    independent = n * spread / memory
+    limit = memory * independent / float(chi2.ppf(0.05, independent))
+    sums, counts = np.bincount(places, left**2), np.bincount(places)
+    logs = np.log(sums[sums > 0.0] / np.maximum(counts[sums > 0.0] - 1, 1))
+    if (m := len(logs)) > 1:
+        beyond = float(student.ppf(0.95, m - 1)) * math.sqrt(1.0 + 1.0 / m) * float(logs.std(ddof=1))
+        limit = max(limit, memory / spread * math.exp(float(logs.mean()) + beyond))
+    return spread, limit
 
 
 def watch_lines(watched: Watched) -> list[str]:
