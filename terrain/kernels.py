@@ -210,6 +210,10 @@ class _ContentCache(FunctionCache):
         vars(self._impl).update(_lineno=code.co_firstlineno, _py_file=code.co_filename, _locator=self)
         self.enable()
 
+    def _index_key(self, signature: Any, codegen: Any) -> Any:
+        """Return what distinguishes overloads in a file: numba would add closures, which differ in each process."""
+        return signature, codegen.magic_tuple()
+
     def _load_overload(self, signature: Any, target_context: Any) -> Any:
         self._place()
         with suppress(OSError):  # a folder that cannot be read
