@@ -728,6 +728,7 @@ def _move_omni(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array
     mass = body.mass_kg * (1.0 + p.payload_ratio)
     inertia = mass, mass, body.yaw_inertia_kgm2 * (1.0 + p.payload_ratio)
     weight, gravity = mass * GRAVITY_MPS2, GRAVITY_MPS2 * body.effective_ratio
+    rolling = (body.rolling_ratio + p.rolling_resistance_ratio) * weight
     step, size = dt / SUBSTEPS, 0.0
     for k in range(n):
         slope = (-mass * gravity * math.sin(grade_rad[k]), -mass * gravity * math.sin(roll_rad[k]), 0.0)
@@ -748,7 +749,7 @@ def _move_omni(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array
             for i in range(body.n_wheels):
                 v = _dot(along[i], before)
                 share = load[i]
-                drag = share * body.rolling_ratio * weight / math.sqrt(v * v + ROLLING_MPS * ROLLING_MPS)
+                drag = share * (rolling / math.sqrt(v * v + ROLLING_MPS * ROLLING_MPS) + p.viscous_drag_nspm)
                 spun = wheels[i] * rollers.sine[i]
                 for a in range(3):
                     pushed[a] += share * (stiff * wheels[i] * along[i, a] - resists * spun * across[i, a])

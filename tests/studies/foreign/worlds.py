@@ -468,7 +468,9 @@ def _effects() -> Iterator[ForeignEffect]:
     change = scene(bearing_nm=lambda c, e: e)
     yield each("bearings", ("skid",), change, 6.0, False, ("rolling_resistance",), (), _SCENE)
     change = scene(roller_nms=lambda c, e: e)
-    yield each("balls_rub", ("omni",), change, 0.05, False, ("roller_friction",), ("wheel_radius",), _SCENE)
+    # a ball's joint resists about its driven axis too
+    nearest = ("viscous_drag", "wheel_radius")
+    yield each("balls_rub", ("omni",), change, 0.05, False, ("roller_friction",), nearest, _SCENE)
     change = scene(steer_offset_rad=lambda c, e: e)
     yield each("wheels_askew", ("car",), change, 0.1, True, ("steering_offset_front",), (), _SCENE)
     change = scene(steer_backlash_rad=lambda c, e: e)

@@ -65,6 +65,8 @@ SLOW = (
     {"wheel_distance_ratio": 0.06},
     {"force_slip_ratio": 0.4},
     {"lever_x_m": 0.05, "lever_y_m": 0.02},
+    {"rolling_resistance_ratio": 0.04},
+    {"viscous_drag_nspm": 20.0},
 )
 
 
