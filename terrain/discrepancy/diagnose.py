@@ -410,31 +410,24 @@ def _withdraw_wrong(problem: Problem, fit: CauseFit, withdrawn: dict[str, verdic
     """Return the causes that may be named; those that were withdrawn are noted by name.
 
     Those of a size that is not plausible go first.  Of others one is withdrawn at a time, the one that gains least, and
-    the rest are fitted anew: a wrong cause distorts the others, and their reasons go with it.
+    the rest are fitted anew: a wrong cause distorts the others, and their reasons go with it.  Effects whose place it
+    took come in if they fit as well.
     """
     for _ in range(MAX_WITHDRAWN):
-        sizes = {cause: reason for cause in fit.causes if (reason := _beyond_belief(problem, fit, cause))}
-        if sizes:
-            worst = max(sizes, key=lambda cause: raw_gain(fit, cause))
-            fit = _without_implausible(problem, fit, worst, sizes[worst], withdrawn)
-            continue
-        reasons = reasons_to_withdraw(problem, fit, _probes(problem, fit))
+        reasons = {cause.name: why for cause in fit.causes if (why := _beyond_belief(problem, fit, cause))}
+        first = max if reasons else min
+        reasons = reasons or reasons_to_withdraw(problem, fit, _probes(problem, fit))
         if not reasons:
             break
         doubtful = [cause for cause in fit.causes if cause.name in reasons]
-        worst = min(doubtful, key=lambda cause: raw_gain(fit, cause))
-        fit = _withdraw(problem, fit, worst, reasons[worst.name], withdrawn)
+        worst = first(doubtful, key=lambda cause: raw_gain(fit, cause))
+        left = _withdraw(problem, fit, worst, reasons[worst.name], withdrawn)
+        more = search_on(problem._replace(barred=frozenset(withdrawn)), left.info, left.causes)
+        if {*more.causes} != {*left.causes}:
+            with_it, without = (fit_again(problem, fit.info, names_of(e.causes))[0] for e in (fit, more))
+            left = more if without - with_it < RIVAL_LOSS * fit.tests[worst.name].inflation else left
+        fit = left
     return fit
-
-
-def _without_implausible(
-    problem: Problem, fit: CauseFit, cause: Effect, reason: str, withdrawn: dict[str, verdict.Cause]
-) -> CauseFit:
-    """Withdraw a cause of a size that is not plausible; other effects take its place if they fit as well."""
-    left = _withdraw(problem, fit, cause, reason, withdrawn)
-    more = search_on(problem._replace(barred=frozenset(withdrawn)), left.info, left.causes)
-    with_it, without = (fit_again(problem, fit.info, names_of(each.causes))[0] for each in (fit, more))
-    return more if without - with_it < RIVAL_LOSS * fit.tests[cause.name].inflation else left
 
 
 def _withdraw_varying(
