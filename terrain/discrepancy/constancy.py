@@ -390,6 +390,8 @@ def varying_effects(problem: Problem, fit: CauseFit) -> tuple[verdict.Varying, .
             there = problem.at(info.origin, names, noise=info.noise, scatter={}, own=at)
             there = info.counted_from(info.origin).with_columns(there).counted_from(base)
             own = _own_values(there, own, known, columns, names)
+        # common values that only cancel each other linearly are no point to go on from; a scatter has to be in both
+        own = min(own, linear, key=lambda each: each.loss) if columns.size else own
         own = own._replace(runs=[runs.in_pattern(problem.signals) for runs in own.runs])
         of = own.clearest
         (low, high), seen = BOUNDS[of.name], of.weight > 0
@@ -537,13 +539,9 @@ def values_by_run(
     if seen.sum() < 2 * MIN_GROUP or not total.max() > 0:
         nothing = np.full(len(total), math.inf)
         return RunValues(name, np.zeros(len(total)), np.ones(len(total)), 0.0, 0.0, nothing)
-    value = np.where(seen, score.sum(axis=1) / np.where(seen, total, 1.0), 0.0)
     use = seen[:, None] & (weight > 0.05 * total[:, None])
-    apart = (score - weight * value[:, None]) ** 2 / np.where(use, weight, 1.0)
-    inside, dof = float(apart[use].sum()), int(np.maximum(use.sum(axis=1) - 1, 0).sum())
-    # thirds of a run share its deviations, most of the variance of a short one: no less than by whitening
-    noise = max((TRUST_DOF + inside) / (TRUST_DOF + dof), 1.0)
-    variance = np.where(seen, noise / np.where(seen, total, 1.0), math.inf)
+    weight, value, dof = _of_thirds(np.where(use, score, 0.0), np.where(use, weight, 0.0))
+    variance = np.where(seen, 1.0 / np.where(seen, weight, 1.0), math.inf)
     precision = 1.0 / (variance + assumed_std**2)
     # one run that is far out is no variation from run to run: the others have to differ as well
     known = np.flatnonzero(seen)
@@ -556,6 +554,31 @@ def values_by_run(
     z = z_of_t(math.sqrt(max(likelihood, 0.0)), TRUST_DOF + dof)
     beyond_noise = math.hypot(own_std, assumed_std)
     return RunValues(name, value + mean, precision, beyond_noise, z, variance)
+
+
+def _of_thirds(score: Array, weight: Array) -> tuple[Array, Array, float]:
+    """Return the precision and value (n,) of runs, and the degrees of freedom of their noise.
+
+    Scores and precisions (n, thirds) are 0 where a third shows nothing.  Values of thirds differ by a scatter of their
+    own beyond the noise, of greatest restricted likelihood (Patterson and Thompson, Biometrika 1971): where a parameter
+    acts most, what the model gets wrong is more than noise, and much information does not make a third as certain.
+    """
+    shows = weight > 0
+    third = np.where(shows, score / np.where(shows, weight, 1.0), 0.0)
+    scatters = SCATTERS * np.ptp(third[shows])
+    own = np.where(shows, 1.0 / (1.0 / np.where(shows, weight, 1.0) + scatters[:, None, None] ** 2), 0.0)
+    total = own.sum(axis=2)
+    some = total[0] > 0
+    value = (own * third).sum(axis=2) / np.where(some, total, 1.0)
+    squares = (own * (third - value[:, :, None]) ** 2).sum(axis=(1, 2))
+    dof = int(shows.sum() - some.sum())
+    determinant = np.log(total[:, some]).sum(axis=1) - np.log(own[:, shows]).sum(axis=1)
+    k = int(np.argmin((dof + TRUST_DOF) * np.log1p(squares / TRUST_DOF) + determinant))
+    # thirds of a run share its deviations, most of the variance of a short one: no less than by whitening
+    noise = max((TRUST_DOF + float(squares[k])) / (TRUST_DOF + dof), 1.0)
+    # a third that has all the information of its run does not show how much the noise is
+    share = own[k] / np.where(some, total[k], 1.0)[:, None]
+    return total[k] / noise, value[k], float((1.0 / (share[some] ** 2).sum(axis=1) - 1.0).sum())
 
 
 def _in_words(

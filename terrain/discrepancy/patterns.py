@@ -168,7 +168,10 @@ def _is_apart(kind: Kind, value: Array, columns: Array, coefficients: Array, wei
         rest = columns[:, 0] > 0
         scatter = math.sqrt(float(np.mean(left[rest] ** 2)))
         size = change / max(scatter, 1.0 / math.sqrt(float(weight[~rest][0])))
-        return 2.0 * len(value) * float(student.sf(size, ROGUE_TAIL_DOF)) < ROGUE_P
+        # in standard deviations of the others, which are known by n - 2 degrees of freedom
+        dof = 1.0 / (1.0 / ROGUE_TAIL_DOF + 1.0 / (len(value) - 2))
+        size /= math.sqrt(1.0 - 2.0 / ROGUE_TAIL_DOF)
+        return 2.0 * len(value) * float(student.sf(size, dof)) < ROGUE_P
     ends = [np.sort(value[of > 0]) for of in columns.T]
     low, high = sorted(ends, key=lambda own: own[0])
     gap = high[0] - low[-1]

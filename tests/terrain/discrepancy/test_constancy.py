@@ -13,6 +13,7 @@ from pipelines.explain.statements import notes_of
 from terrain.discrepancy.constancy import (
     CAVEAT_RATIO,
     VARIES_RATIO,
+    _of_thirds,
     agreement,
     constancy_of,
     fit_mixed,
@@ -286,7 +287,7 @@ def test_what_is_wrong_in_all_runs_does_not_decide_what_varies_between_them(hide
             "agrimaro",
         ),
         # of two parameters the one that differs is stated
-        ("lever_y_m", 0.06, "lever_arm camera_yaw gyro_scale", ("lever_arm", ()), "husky"),
+        ("lever_y_m", 0.08, "lever_arm camera_yaw gyro_scale", ("lever_arm", ()), "husky"),
         # far from where sensitivities are taken first
         ("effective_track_ratio", 0.8, "effective_track turning_slip", ("effective_track", ()), "husky"),
     ],
@@ -377,3 +378,15 @@ def test_free_variances_are_of_greatest_likelihood_the_others_stay_and_none_is_b
     _, shared, std = fit_mixed(gram(columns), BOTH, OWN, np.full(2, 0.1), np.ones(2), FREE)
     assert_allclose(std, 0.1)
     assert_allclose(shared, [2.0, 1.0], rtol=1e-9)
+
+
+def test_what_the_model_gets_wrong_where_a_parameter_acts_most_makes_no_run_differ():
+    """Values of thirds scatter by 0.1 beside their noise: much information does not make a third more certain."""
+    rng, n = np.random.default_rng(4), 400
+    precision = np.exp(rng.uniform(np.log(1e1), np.log(1e5), (n, 3)))
+    third = 0.1 * rng.standard_normal((n, 3)) + rng.standard_normal((n, 3)) / np.sqrt(precision)
+    weight, value, dof = _of_thirds(precision * third, precision)
+    assert 0.8 < np.mean(value**2 * weight) < 1.2
+    # one third of three that has all the information shows nothing of the noise
+    assert n < dof < 2 * n
+    assert _of_thirds(*np.array([[[1e3, 1e-3, 1e-3]] * n] * 2))[2] < 0.01

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from terrain.discrepancy.patterns import Kind, pattern_of
+from terrain.discrepancy.patterns import Kind, _is_apart, pattern_of
 
 N = 20
 PLACE, NO_SESSION = np.arange(float(N)), [""] * N
@@ -98,3 +98,15 @@ def test_runs_that_agree_by_more_than_their_noise_show_what_it_is():
     assert (found.kind, found.z > 6.0) == (Kind.ROGUE, True)
     low, high = found.at(np.array([-1.0, 1.0]))[1]
     assert 0.0 < high - low < 4 * 0.006
+
+
+@pytest.mark.parametrize("n", [6, 20, 80])
+def test_the_farthest_of_values_with_heavy_tails_is_seldom_apart(n):
+    """One in a hundred is stated, of runs that scatter with Student's distribution of four degrees of freedom."""
+    values, apart = np.random.default_rng(n).standard_t(4.0, (1000, n)), 0
+    for value in values:
+        own = np.arange(n) == np.argmax(np.abs(value - np.median(value)))
+        columns = np.column_stack([~own, own]).astype(float)
+        means = np.array([value[~own].mean(), value[own].mean()])
+        apart += _is_apart(Kind.ROGUE, value, columns, means, np.full(n, 1e6))
+    assert apart <= 20
