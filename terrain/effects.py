@@ -434,7 +434,7 @@ def _undo_wheel_dead_zone(block: Block, dead_mps: float) -> None:
 def _undo_drive_backlash(block: Block, half_rad: float) -> None:
     """Pass the distance of each wheel through the play; its speed is that part of the motor's that it moves by.
 
-    That is the mean of the steps before and after a sample, the latter at its speed.
+    That is the mean of the steps before and after a sample, the latter as it goes on.
     """
     for i, factor in _wheel_columns(block):
         half = half_rad * block.robot.wheel_radius_m / factor
@@ -444,7 +444,9 @@ def _undo_drive_backlash(block: Block, half_rad: float) -> None:
         for k in np.flatnonzero(known).tolist():
             speed, time_s = float(block.values[k, i]), float(block.time_s[k])
             dt = max(time_s - last_s, 0.0) if math.isfinite(last) else 0.0
-            step, coming = 0.5 * dt * (last + speed) if dt else 0.0, dt * speed
+            step = coming = 0.0
+            if dt:
+                step, coming = 0.5 * dt * (last + speed), 0.5 * dt * (3.0 * speed - last)
             now = min(max(ahead - step, -half), half)
             after = min(max(now - coming, -half), half)
             if coming != 0.0:

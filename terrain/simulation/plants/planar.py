@@ -450,7 +450,9 @@ def turned_wheels(encoder_mps: Array, p: Any, radius_m: float, dt: float) -> Arr
             speed = out[k, i] + dead_mps * direction(out[k, i])
             out[k, i] = speed
             if play_m > 0.0:
-                step, coming = 0.5 * dt * (before + speed) if k > 0 else 0.0, dt * speed
+                step, coming = 0.0, dt * speed
+                if k > 0:  # as it goes on
+                    step, coming = 0.5 * dt * (before + speed), 0.5 * dt * (3.0 * speed - before)
                 now = min(max(ahead - step, -play_m), play_m)
                 after = min(max(now - coming, -play_m), play_m)
                 if coming != 0.0:
