@@ -21,7 +21,7 @@ from terrain.discrepancy import constancy, verdict
 from terrain.discrepancy.clocks import latencies_of, shifts_of
 from terrain.discrepancy.earned import MIN_RUNS, OUTWEIGHS, HeldOut, Judgement, crossed_runs, judge
 from terrain.discrepancy.evidence import EXCITED_RATIO, Z_EFFECT, Evidence, move_point, partial_information
-from terrain.discrepancy.gain import THIRDS
+from terrain.discrepancy.gain import THIRDS, earned
 from terrain.discrepancy.health.fault import Fault, repaired
 from terrain.discrepancy.health.faults import faults_of
 from terrain.discrepancy.health.unfit import Clock, clocks_of, unfit_runs
@@ -350,8 +350,8 @@ def statement_of(found: Found, judgement: Judgement) -> verdict.Diagnosis:
         acting = [cause for cause in stated if name in judgement.acting[cause.name]]
         hidden = [p for effect in effects if name in effect.channels[:1] for p in effect.parameters]
         tiers = {
-            Tier.NAMED: judgement.earned(of) and any(cause in causes for cause in acting),
-            Tier.SET: judgement.earned(of) and any(cause in of_sets for cause in acting),
+            Tier.NAMED: earned(of) and any(cause in causes for cause in acting),
+            Tier.SET: earned(of) and any(cause in of_sets for cause in acting),
             Tier.CANDIDATE: any(name in cause.channels for cause in candidates)
             or any(own.channel == name for own in varying),
             Tier.UNEXPLAINED: any(left.channel == name for left in unexplained)
@@ -361,7 +361,7 @@ def statement_of(found: Found, judgement: Judgement) -> verdict.Diagnosis:
         tier = next((tier for tier, holds in tiers.items() if holds), None)
         names = tuple(cause.name for cause in acting)
         channels.append(verdict.ChannelVerdict(name, tier, names, *of))
-    whole = judgement.earned(judgement.gain)
+    whole = earned(judgement.gain)
     tiers = {
         Tier.NAMED: bool(causes) and whole,
         Tier.SET: bool(of_sets) and whole,

@@ -12,16 +12,26 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
 
+from terrain.bootstrap import LEVEL
 from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, beside_extended, compare_runs
-from terrain.discrepancy.evidence import MIN_CLUSTERS, evidence_at
+from terrain.discrepancy.evidence import (
+    Evidence,
+    evidence_at,
+    marginal_parts,
+    move_point,
+    pooled_variance,
+)
 from terrain.discrepancy.gain import (
-    ChannelGain,
+    HALF,
+    NONE,
+    THIRDS,
     Gain,
     Interval,
-    earns,
     gain_of,
     gains_of,
+    of_clusters,
     removed_by,
     squares_of,
     weights_of,
@@ -98,11 +108,6 @@ class HeldOut(NamedTuple):
     excluded: tuple[Excluded, ...] = ()
 
     @property
-    def shown(self) -> bool:
-        """Whether runs are left out in turn that are enough for an interval of the evidence itself."""
-        return self.in_turn and len(self.plain) >= MIN_CLUSTERS
-
-    @property
     def in_turn(self) -> bool:
         """Whether the runs are those behind the diagnosis, left out in turn."""
         return any(self.left_out)
@@ -112,6 +117,12 @@ class HeldOut(NamedTuple):
         extended = [self.simulation.with_effects(own) for own in values]
         runs = zip(self.plain, self.signals, self.fold, strict=True)
         return tuple(beside_extended(run, own, extended[k], self.low_pass) for run, own, k in runs)
+
+    def evidence(self, fit: CauseFit) -> Evidence:
+        """Return the evidence of the runs about a fit, by its noise and scatter."""
+        point = move_point(self.simulation.vector, fit.names, fit.change)
+        about = self.simulation, point, fit.names, self.low_pass, fit.info.noise, fit.info.scatter
+        return evidence_at(self.signals, *about).counted_from(self.simulation.vector)
 
     def gain(self, runs: Sequence[ComparedRun]) -> Gain:
         """Return the gain of what is built in beside the runs."""
@@ -188,28 +199,26 @@ def crossed_runs(
     )
 
 
-def values_by_part(fit: CauseFit, built: Mapping[str, float], on: HeldOut) -> list[dict[str, float]]:
+def values_by_part(fit: CauseFit, names: Sequence[str], on: HeldOut) -> list[dict[str, float]]:
     """Return the values of parameters that are built in as they are fitted without the runs of each part.
 
-    The step from the fit to all runs is linear, with the same causes.
+    Steps from the fit are linear; of fewer parameters than were fitted, those that are left make up for the others.
     """
-    places = fit.info.places(fit.names)
-    a, g = fit.info.clusters(places)
-    unit = np.sqrt(np.maximum(np.einsum("kii->i", a), 1e-30))
-    tiny, values = 1e-9 * np.eye(len(places)), []
+    info = fit.info
 
-    def solved(runs: Sequence[int]) -> Array:
+    def solved(names: Sequence[str], runs: Sequence[int] = ()) -> Array:
+        a, g = info.clusters(info.places(names))
+        unit = np.sqrt(np.maximum(np.einsum("kii->i", a), 1e-30))
         rest = [i for i in range(len(a)) if i not in runs]
-        system = a[rest].sum(axis=0) / np.outer(unit, unit) + tiny
+        system = a[rest].sum(axis=0) / np.outer(unit, unit) + 1e-9 * np.eye(len(names))
         return np.asarray(np.linalg.solve(system, g[rest].sum(axis=0) / unit) / unit)
 
-    every = solved(()) if built else np.zeros(0)
+    pooled, values = dict(zip(fit.names, fit.change - solved(fit.names), strict=True)), []
     for runs in on.left_out:
-        step = solved(runs) - every if runs and built else 0.0 * every
         own = {}
-        for name, value in built.items():
+        for name, value in zip(names, solved(names, runs).tolist(), strict=True):
             low, high = (bound - on.simulation.effects.get(name, 0.0) for bound in BOUNDS[name])
-            own[name] = min(max(value + float(step[fit.names.index(name)]), low), high)
+            own[name] = min(max(pooled[name] + value, low), high)
         values.append(own)
     return values
 
@@ -223,44 +232,54 @@ class Judgement(NamedTuple):
     """Part of the square before the extension that each removes beside the others, in the channels where it acts."""
     acting: Mapping[str, tuple[str, ...]]  #: channels beside which each is stated, the largest change first
     reasons: Mapping[str, str]  #: why some do not earn their names; empty where all do
-    shown: bool  #: whether runs were left out in turn that are enough for an interval of the evidence itself
-
-    def earned(self, gain: Gain | ChannelGain) -> bool:
-        """Return whether a gain, of a channel or of all, is as good as :func:`terrain.discrepancy.gain.earns` asks."""
-        return earns(gain.reduction, gain.ci, gain.learner_reduction, self.shown)
 
 
 def judge(fit: CauseFit, built: Sequence[Effect], on: HeldOut) -> Judgement:
     """Return how causes that are built in do on runs held out.
 
-    A cause earns its name where, over the channels where it acts, it removes a part of the square beside the others
-    whose interval is above 0, and the extension at least half of what the learner does, and where it makes no channel
-    worse.
+    A cause earns its name where the part of the square that goes with it, over what the others leave that are refitted
+    without it, has its interval above 0, where the extension removes at least half of what the learner does over the
+    channels where the cause acts, and where it makes no channel worse.  That part is of the squares themselves, or by
+    how much likelier the runs are (:func:`likelier_with`), whichever interval is narrower: of what changes little the
+    noise of all else, and what varies from run to run, hide the first.
+
+    Where runs are so few that their thirds are the clusters, causes are judged together: where the second interval of
+    all of them is above 0, one is dropped only if the runs do not show it by themselves, the interval of the part of
+    its change that they have holding 0, or are no likelier with it.  What varies from run to run is the same in thirds
+    of one, so that these do not show that a channel gets worse.
     """
-    change = dict(zip(fit.names, fit.change.tolist(), strict=True))
-    of_parts = values_by_part(fit, {name: change[name] for name in names_of(built)}, on)
+    names = names_of(built)
+    of_parts = values_by_part(fit, names, on)
     runs = on.beside(of_parts) if built else on.plain
     gain, weights, squares = on.gain(runs), weights_of(on.noise), squares_of(runs, on.learned)[0]
     removed, acting, reasons = {}, {}, {}
-    whole = (
-        removed_by(runs, [run._replace(after=run.before) for run in runs], weights).changes if built else 0.0
-    )
+    if built:
+        whole = removed_by(runs, [run._replace(after=run.before) for run in runs], weights).changes
+        info = on.evidence(fit)
+        none: list[dict[str, float]] = [{}] * len(of_parts)
+        few = gain.clusters == THIRDS
+        together = few and likelier_with(info, of_parts, none, on, runs)[1][0] > 0.0
     for cause in built:
-        own = names_of([cause])
-        rest = [{name: value for name, value in part.items() if name not in own} for part in of_parts]
+        rest = values_by_part(fit, [name for name in names if name not in names_of([cause])], on)
         part = removed_by(runs, on.beside(rest), weights)
         acts = part.changes >= max(ACTS * float(part.changes.max()), 1e-30)
         order = [CHANNELS[c] for c in np.argsort(-part.changes, kind="stable")]
         main = [name for name in order if acts[CHANNELS.index(name)]]
         changed = part.changes >= np.maximum(SHARE * whole, 1e-30)
         acting[cause.name] = tuple(n for n in order if n in gain.channels and changed[CHANNELS.index(n)])
-        ratio, interval = removed[cause.name] = part.gain(weights * acts, on.seed)
+        by_square = part.gain(weights * acts, on.seed)
+        size = part.size(weights * acts)
+        likelier, ends = likelier_with(info, of_parts, rest, on, runs)
+        by_evidence = size * likelier, (size * ends[0], size * ends[1])
+        both = [by_evidence] if together else [by_square, by_evidence]
+        ratio, (low, high) = min(both, key=lambda gain: gain[1][1] - gain[1][0])
+        ratio, interval = removed[cause.name] = min(ratio, 1.0), (low, min(high, 1.0))
         own_gain, learner, _ = gains_of(squares @ (weights * acts), True, on.seed)
         words = " and ".join([CHANNEL_WORDS[name][0] for name in main])
         net = float(((part.squares[:, 1] - part.squares[:, 2]).sum(axis=0) * weights).sum())
-        if not earns(ratio, interval, -math.inf, on.shown):
+        if not (likelier > 0.0 and ends[0] > -1.0 if together else interval[0] > 0.0):
             reasons[cause.name] = f"{_percent(ratio, interval)} of the square of {words} go with it"
-        elif not earns(*own_gain, learner[0], on.shown):
+        elif own_gain[0] < HALF * learner[0]:
             beside = f"a black-box learner removes {100 * learner[0]:.0f} %"
             reasons[cause.name] = f"{_percent(*own_gain)} of the square of {words} go, {beside}"
         for name in gain.channels:
@@ -268,11 +287,40 @@ def judge(fit: CauseFit, built: Sequence[Effect], on: HeldOut) -> Judgement:
             c = CHANNELS.index(name)
             added = -more * part.squares[:, 0, c].sum() * weights[c]
             outweighed = net + added > OUTWEIGHS * added
-            if more < -WORSE and ends[1] < 0.0 and not outweighed:
+            if more < -WORSE and ends[1] < 0.0 and not outweighed and not few:
                 worse = f"{CHANNEL_WORDS[name][0]} worse, by {-100 * more:.0f} % of its square"
                 reasons.setdefault(cause.name, f"it makes {worse}")
     reasons = {name: f"on {on.how}: {why}" for name, why in reasons.items()}
-    return Judgement(gain, runs, removed, acting, reasons, on.shown)
+    return Judgement(gain, runs, removed, acting, reasons)
+
+
+def likelier_with(
+    info: Evidence,
+    values: Sequence[Mapping[str, float]],
+    others: Sequence[Mapping[str, float]],
+    on: HeldOut,
+    runs: Sequence[ComparedRun],
+) -> tuple[float, Interval]:
+    """Return by how much runs are likelier with values than with ``others``, over the square of the change, at most 1.
+
+    With ``r`` what the others leave, ``d`` the change from these to the values, and ``S`` the covariance of the noise
+    with what varies from run to run, minus twice the log-likelihood falls by ``2 d'S^-1 r - d'S^-1 d``.  Over ``d'S^-1
+    d`` that is ``2 b - 1``: ``b`` is the part of the change that these runs show, 1 if all of it is there, and above
+    0.5 they are nearer to the values than to the others.  Its 95 % interval is by the variance of the evidence, see
+    :func:`terrain.discrepancy.evidence.pooled_variance`.
+    """
+    parts = marginal_parts(info.grams, info.nuisances, info.nuisance_std)
+    x, y = (
+        np.array([[*[-each[k].get(name, 0.0) for name in info.names], 1.0] for k in on.fold])
+        for each in (values, others)
+    )
+    score, square = (of_clusters(np.einsum("ik,ibkl,il->ib", y - x, parts, z), runs) for z in (y, y - x))
+    if not (size := float(square.sum())) > 0.0:
+        return NONE
+    shown = float(score.sum()) / size
+    variance, dof = pooled_variance(score - shown * square, np.clip(square / size, 0.0, 0.9), size)
+    half = 2.0 * float(stdtrit(dof, 0.5 * (1.0 + LEVEL))) * math.sqrt(variance / size)
+    return 2.0 * shown - 1.0, (2.0 * shown - 1.0 - half, 2.0 * shown - 1.0 + half)
 
 
 def _percent(ratio: float, interval: Interval) -> str:

@@ -62,13 +62,9 @@ def part_removed(removed: Array, square: Array, seed: int) -> tuple[float, Inter
     return part, (min(low, 1.0), min(high, 1.0))
 
 
-def earns(reduction: float, ci: Interval, learner_reduction: float, shown: bool) -> bool:
-    """Return whether a gain is at least half of the learner's, and above 0 with its interval.
-
-    The interval may hold 0 where it is ``shown`` already that it helps runs left out in turn: with what varies from run
-    to run taken out, in the evidence of its causes (:attr:`terrain.discrepancy.evidence.WaldTest.gain_interval`).
-    """
-    return (reduction if shown else ci[0]) > 0.0 and not reduction < HALF * learner_reduction
+def earned(gain: ChannelGain | Gain) -> bool:
+    """Return whether what is built in removes something, and at least half of what the learner does."""
+    return gain.reduction > 0.0 and not gain.reduction < HALF * gain.learner_reduction
 
 
 class ChannelGain(NamedTuple):
@@ -169,6 +165,11 @@ class Removed(NamedTuple):
     #: (clusters, 3, channels) before the extension, with the rest, and with the cause beside it
     squares: Array
 
+    def size(self, weights: Array) -> float:
+        """Return the square of its change over the square before, of channels by their weights."""
+        before = float((self.squares[:, 0] @ weights).sum())
+        return float((self.changes**2)[weights > 0.0].sum()) / before if before > 0.0 else math.nan
+
     def gain(self, weights: Array, seed: int) -> tuple[float, Interval]:
         """Return the part of the square before that it removes, of channels by their weights (channels,)."""
         before, rest, beside = (self.squares @ weights).T
@@ -186,6 +187,12 @@ def removed_by(runs: Sequence[ComparedRun], others: Sequence[ComparedRun], weigh
     total = np.zeros((clusters.of.max(initial=-1) + 1, 4, len(CHANNELS)))
     np.add.at(total, clusters.of, np.array(squares))
     return Removed(np.sqrt(total[:, 3].sum(axis=0) * weights), total[:, :3])
+
+
+def of_clusters(parts: Array, runs: Sequence[ComparedRun]) -> Array:
+    """Return sums (clusters,) of what each third (runs, N_BLOCKS) of runs has."""
+    clusters = _clusters(runs)
+    return np.bincount(clusters.of, parts.ravel() if clusters.n_parts > 1 else parts.sum(axis=1))
 
 
 def weights_of(noise: Mapping[str, float]) -> Array:

@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
 
-from studies.blind_trials.trial import DRIVE_ROWS, FAULTS, KNOWN, OUTSIDE, ROBOTS, Row, Trial, value_is_right
+from studies.blind_trials.trial import (
+    DRIVE_ROWS,
+    FAULTS,
+    KNOWN,
+    OUTSIDE,
+    ROBOTS,
+    Row,
+    Trial,
+    Varying,
+    value_is_right,
+)
 from terrain.bootstrap import proportion_interval
 from terrain.discrepancy.verdict import Tier
 from terrain.effects import library_of
@@ -115,7 +125,7 @@ def _measured_scores(rows: Mapping[Row, Sequence[Trial]]) -> Iterator[tuple[str,
     right = []  # the runs with the effect are a group of their own
     for trial in (t for t in rows[Row.HALF] if varies(t, t.causes[0])):
         of_cause = [each for each in trial.varying if {each.name, *each.rivals} & {*trial.causes}]
-        right.append(any({*ids} == {*trial.present} for each in of_cause for _, ids in each.groups))
+        right.append(any(each.groups and parts(each, {*trial.present}) for each in of_cause))
     yield "half: groups of runs are right", score(right)
     late = rows[Row.SENSOR_LATE]
     for sensor in dict.fromkeys(t.variant for t in late):
@@ -133,6 +143,11 @@ def _measured_scores(rows: Mapping[Row, Sequence[Trial]]) -> Iterator[tuple[str,
         yield f"known, {known}: named, value within 5 %", named
         wrong = score((bool(wrong_names(t)) for t in some), most=0.01)
         yield f"known, {known}: a wrong single name", wrong
+
+
+def parts(varying: Varying, present: Set[str]) -> bool:
+    """Return whether no group holds runs with an effect beside others without."""
+    return all({*ids} <= present or not {*ids} & present for _, ids in varying.groups)
 
 
 def _all_found(trial: Trial) -> bool:

@@ -232,10 +232,12 @@ def test_a_trial_takes_what_the_diagnosis_answers(monkeypatch):
         excluded_runs=(SimpleNamespace(run_id="b"),),
         faults=(SimpleNamespace(change=deg, sentence="it is in deg/s"),),
         varying=(SimpleNamespace(name="payload", groups=groups, rivals=("motor_constant",)),),
+        gain=SimpleNamespace(excluded_runs=(SimpleNamespace(run_id="d"),)),
     )
-    monkeypatch.setattr("studies.blind_trials.trial.diagnose", lambda *_: answer)
+    diagnosed = SimpleNamespace(diagnosis=answer)
+    monkeypatch.setattr("studies.blind_trials.trial.diagnose_runs", lambda *_: diagnosed)
     trial = run_trial(cases_of(Row.FAULT, 1, 0, 3)[0])
-    assert (trial.clock_s, trial.excluded) == (pytest.approx(-0.25), ("b",))
+    assert (trial.clock_s, trial.excluded) == (pytest.approx(-0.25), ("b", "d"))
     assert trial.statements == (("unit", "gyro", "it is in deg/s"),)
     assert trial.varying == (Varying("payload", ((0.1, ("a",)), (0.2, ("c",))), ("motor_constant",)),)
     assert trial.intervals == {"motor_constant_ratio": (0.1, 0.0, 0.2)}

@@ -1,6 +1,7 @@
 """Blind trials: effects are hidden in simulated runs at random around their detection limits, and asked for.
 
-The diagnosis gets run logs without truth and without source, and knows nothing of this module.
+They are diagnosed by what ``terrain explain`` calls, a quarter of the runs held out; it gets logs without truth and
+without source, and knows nothing of this module.
 """
 
 from __future__ import annotations
@@ -24,10 +25,8 @@ from studies.blind_trials.drives import (
     rich_drives,
 )
 from studies.blind_trials.limits import Limits, Sensing, confusable_class, limits_of
-from terrain.discrepancy.diagnose import diagnose
-from terrain.discrepancy.grounds import simulation_for
+from terrain.discrepancy.diagnosed_runs import diagnose_runs
 from terrain.discrepancy.health.fault import Column, FaultKind
-from terrain.discrepancy.held_out import split_runs
 from terrain.discrepancy.runs import Simulation
 from terrain.discrepancy.verdict import Tier
 from terrain.effects import (
@@ -50,7 +49,6 @@ from terrain.effects import (
     nuisances_of,
 )
 from terrain.errors import DataError
-from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.schema import TWIST
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import BicycleRobot, Robot, load_robot
@@ -339,7 +337,7 @@ def _averaged(stamps_s: Array, values: Array, time_s: Array) -> Array:
 
 
 # -- Runs of the dynamic simulation, which differs from the planar one that the diagnosis replays ----------
-# They are made by what ``terrain simulate`` calls, and diagnosed as ``terrain explain`` does.
+# They are made by what ``terrain simulate`` calls.
 
 TERRAIN, SCENARIOS = "grass", ("complex", "starts", "survey")
 HIDDEN = {"wheel_radius_ratio": 0.03}  #: in every second trial
@@ -348,12 +346,12 @@ HIDDEN = {"wheel_radius_ratio": 0.03}  #: in every second trial
 def dynamic_runs(
     robot: Robot, scenario: str, vary: bool, seed: int, n_runs: int, effects: Mapping[str, float]
 ) -> tuple[RunLog, ...]:
-    """Return runs 1, 2... of a scenario, as ``terrain explain`` diagnoses them; the truth is removed."""
+    """Return runs 1, 2... of a scenario, without the truth."""
     runs = []
     for number in range(1, n_runs + 1):
         run = simulate_run(robot, TERRAIN, scenario, seed, number, vary=vary, effects=effects)
         shown = {name: stream for name, stream in run.streams.items() if name != "truth"}
-        runs.append(with_wheel_speeds(replace(run, streams=shown, source=""), robot))
+        runs.append(replace(run, streams=shown, source=""))
     return tuple(runs)
 
 
@@ -568,7 +566,7 @@ def run_trial(case: Case) -> Trial:
     stage = stage_of(case, robot, np.random.default_rng(drawn), noise)
     hidden, start_s = stage.hidden, time.perf_counter()
     try:
-        found = diagnose(stage.runs, stage.simulation or simulation_of(robot), hidden.library)
+        found = diagnose_runs(stage.runs, robot, hidden.library, None, case.seed).diagnosis
     except DataError as error:
         answer: dict[str, Any] = {"refusal": str(error)}
     else:
@@ -584,7 +582,7 @@ def run_trial(case: Case) -> Trial:
             "intervals": {value.name: (value.value, value.low, value.high) for value in values},
             "gain_low": min((cause.gain_ci[0] for cause in found.causes), default=math.nan),
             "clock_s": float(np.median(known_s)) if known_s.size else math.nan,
-            "excluded": tuple(run.run_id for run in found.excluded_runs),
+            "excluded": tuple(run.run_id for run in (*found.excluded_runs, *found.gain.excluded_runs)),
             "varying": tuple(
                 Varying(
                     effect.name, tuple((group.value, group.runs) for group in effect.groups), effect.rivals
@@ -650,7 +648,6 @@ class Stage(NamedTuple):
     hidden: Hidden  #: in them
     limits: Limits | None  #: of the drives, for the confusable classes; None where nothing is hidden
     asked: Mapping[str, Any] = MappingProxyType({})  #: fields of a trial that some rows have
-    simulation: Simulation | None = None  #: under test; None for the one with the known scatter
 
 
 class Draw(NamedTuple):
@@ -697,11 +694,7 @@ class Draw(NamedTuple):
 def stage_of(case: Case, robot: Robot, rng: np.random.Generator, noise: np.random.SeedSequence) -> Stage:
     """Draw a trial: ``rng`` draws what is driven and hidden, ``noise`` seeds all that differs from run to run."""
     draw = Draw(case, robot, rng, noise)
-    if case.row not in _STAGES:
-        return _with_known_scatter(draw)
-    stage = _STAGES[case.row](draw)
-    # with the simulation that ``terrain explain`` would test
-    return stage._replace(simulation=simulation_for(stage.runs, robot, stage.hidden.library)[0])
+    return _STAGES.get(case.row, _with_known_scatter)(draw)
 
 
 def _with_known_scatter(draw: Draw) -> Stage:
@@ -859,14 +852,14 @@ def _dynamic(draw: Draw) -> Stage:
     number = draw.case.number
     scenario, vary, values = SCENARIOS[number // 2 % 3], number // 6 % 2 == 1, HIDDEN if number % 2 else {}
     seed = int(draw.rng.integers(2**31))
-    used, _ = split_runs(dynamic_runs(draw.robot, scenario, vary, seed, draw.case.n_runs, values), None, 0)
+    runs = dynamic_runs(draw.robot, scenario, vary, seed, draw.case.n_runs, values)
     causes, limits = tuple(e.name for e in draw.library if e.parameters[0].name in values), None
     if values:  # of the commanded twists on level ground
         axes = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
-        twists = [np.column_stack([run.streams["commands"].channel(axis) for axis in axes]) for run in used]
+        twists = [np.column_stack([run.streams["commands"].channel(axis) for axis in axes]) for run in runs]
         limits = limits_of(draw.robot, Drives(tuple(twists), (Conditions(),) * len(twists)))
     variant = f"{scenario}, varied" if vary else scenario
-    return Stage(tuple(used), Hidden(draw.library, dict(values), causes), limits, {"variant": variant})
+    return Stage(runs, Hidden(draw.library, dict(values), causes), limits, {"variant": variant})
 
 
 def _known(draw: Draw) -> Stage:

@@ -7,10 +7,11 @@ import pytest
 
 from terrain.discrepancy import diagnose as diagnose_module
 from terrain.discrepancy import earned
+from terrain.discrepancy import gain as gain_module
 from terrain.discrepancy.diagnose import diagnose, find_causes
 from terrain.discrepancy.diagnosed_runs import diagnose_runs, held_out_gain
-from terrain.discrepancy.earned import crossed_runs, judge
-from terrain.discrepancy.gain import earns, part_removed, ratio_of_sums, removed_by, weights_of
+from terrain.discrepancy.earned import crossed_runs, judge, likelier_with
+from terrain.discrepancy.gain import part_removed, ratio_of_sums, removed_by, weights_of
 from terrain.discrepancy.held_out import split_runs
 from terrain.discrepancy.verdict import Tier
 from terrain.effects import CHANNELS, effect_named
@@ -37,15 +38,18 @@ def turned(hide):
     return hide(YAW, n=8, duration_s=20.0)
 
 
+def planted(hide, name, value):
+    """Return runs of which those that are held out have the opposite of what the others have."""
+    runs, other = (hide({name: sign * value}, n=8, duration_s=20.0) for sign in (1, -1))
+    ids = {run.run_id for run in split_runs(runs, None, 0)[1]}
+    return [there if run.run_id in ids else run for run, there in zip(runs, other, strict=True)]
+
+
 def test_what_fits_the_runs_used_and_not_those_held_out_is_a_candidate_and_builds_nothing_in(hide, turned):
     right = diagnosed(turned)
     assert [cause.name for cause in right.diagnosis.causes] == ["camera_yaw"]
     assert right.diagnosis.verdict is Tier.NAMED
-    _, held = split_runs(turned, None, 0)
-    ids = {run.run_id for run in held}
-    other = {run.run_id: run for run in hide({"camera_yaw_rad": -0.05}, n=8, duration_s=20.0)}
-    planted = [other[run.run_id] if run.run_id in ids else run for run in turned]
-    wrong = diagnosed(planted)
+    wrong = diagnosed(planted(hide, "camera_yaw_rad", 0.05))
     assert (wrong.diagnosis.causes, wrong.extended) == ((), None)
     assert wrong.diagnosis.verdict is Tier.CANDIDATE
     (candidate,) = [each for each in wrong.diagnosis.candidates if each.name == "camera_yaw"]
@@ -123,18 +127,12 @@ def test_sessions_are_held_out_and_a_run_that_cannot_be_compared_is_excluded_wit
 
 
 @pytest.mark.parametrize(
-    ("reduction", "low", "learner", "shown", "expected"),
-    [
-        (0.5, 0.1, 0.9, False, True),
-        (0.4, 0.1, 0.9, False, False),  # under half of what the learner removes
-        (0.5, -0.1, 0.6, False, False),  # its interval holds 0
-        (0.5, -0.1, 0.6, True, True),
-        (-0.1, -0.2, -0.9, True, False),
-        (0.2, 0.1, -0.9, False, True),
-    ],
+    ("reduction", "learner", "expected"),
+    [(0.5, 0.9, True), (0.4, 0.9, False), (-0.1, -0.9, False), (0.2, -0.9, True)],
 )
-def test_a_gain_is_earned_above_0_and_by_half_of_the_learners(reduction, low, learner, shown, expected):
-    assert earns(reduction, (low, 1.0), learner, shown) is expected
+def test_a_gain_is_earned_above_0_and_by_half_of_the_learners(turned, reduction, learner, expected):
+    gain = diagnosed(turned).diagnosis.gain._replace(reduction=reduction, learner_reduction=learner)
+    assert gain_module.earned(gain) is expected
 
 
 @pytest.mark.parametrize(("others", "is_named"), [(20.0, True), (5.0, False)])
@@ -149,19 +147,55 @@ def test_a_channel_made_slightly_worse_speaks_against_a_cause_that_removes_littl
     weights = weights_of(on.noise)
     worse, better = CHANNELS.index("current_a"), CHANNELS.index("speed_y_mps")
 
-    def planted(*about):
+    def worsened(*about):
         removed = removed_by(*about)
         squares = np.zeros_like(removed.squares)
         squares[:, :, worse] = np.array([1.0, 1.0, 1.05]) / weights[worse]
         squares[:, :, better] = np.array([0.05 * others, 0.05 * others, 0.0]) / weights[better]
         return removed._replace(squares=squares)
 
-    monkeypatch.setattr(earned, "removed_by", planted)
+    monkeypatch.setattr(earned, "removed_by", worsened)
     reasons = judge(found.fit, found.built_in, on).reasons
     if is_named:
         assert reasons == {}
     else:
         assert "it makes sum of the motor currents worse, by 5 % of its square" in reasons["camera_yaw"]
+
+
+def judged_on_held_out(runs):
+    """Return the fit to the runs used, what is built in, and the runs held out."""
+    asked = {}
+
+    def keep(*about):
+        asked["about"] = about
+        return judge(*about)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(diagnose_module, "judge", keep)
+        diagnosed(runs)
+    return asked["about"]
+
+
+@pytest.mark.parametrize("over", [1.0, 2.0, -1.0])
+def test_how_much_likelier_runs_are_follows_from_how_much_of_a_value_they_have(turned, over):
+    fit, built, on = judged_on_held_out(turned)
+    names, values = [cause.name for cause in built], [{"camera_yaw_rad": 0.05 * over}]
+    likelier, (low, high) = likelier_with(on.evidence(fit), values, [{}], on, on.plain)
+    assert names == ["camera_yaw"]
+    assert likelier == pytest.approx(2.0 / over - 1.0, abs=0.1)
+    assert low < likelier < high
+
+
+@pytest.mark.parametrize(
+    ("likelier", "low", "is_named"), [(0.5, -0.5, True), (0.5, -1.5, False), (-0.1, -0.5, False)]
+)
+def test_of_causes_that_few_runs_confirm_together_one_goes_that_they_do_not_show(
+    turned, monkeypatch, likelier, low, is_named
+):
+    about = judged_on_held_out(turned)
+    answers = iter([(0.9, (0.5, 1.3)), (likelier, (low, 1.5))])  # of all causes, then of one
+    monkeypatch.setattr(earned, "likelier_with", lambda *_: next(answers))
+    assert (judge(*about).reasons == {}) is is_named
 
 
 def test_no_more_than_all_of_a_square_is_removed():
@@ -187,7 +221,7 @@ def test_candidates_for_one_channel_are_what_a_next_drive_decides_between(hide, 
     asked = []
     monkeypatch.setattr(diagnose_module, "next_drive", lambda simulation, sets, *_: asked.append(sets))
     library = tuple(map(effect_named, ("rolling_resistance", "viscous_drag", "payload", "camera_yaw")))
-    diagnosis = diagnosed(hide({"motor_drift_ratio": 0.6}, n=8, duration_s=20.0), library=library).diagnosis
+    diagnosis = diagnosed(planted(hide, "motor_drift_ratio", 0.6), library=library).diagnosis
     of_current = [each.name for each in diagnosis.candidates if each.channels[0] == "current_a"]
     assert len(of_current) > 1
     assert asked[-1] == [tuple(of_current[:3])]
