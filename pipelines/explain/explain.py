@@ -33,7 +33,7 @@ class ExplainOptions(BaseSettings):
     """Effects that may be named, by commas; all by default."""
     terrain: str | None = setting(None, "Use only runs of this label.")
     hold_out: int | None = setting(None, ge=0)
-    """Runs held out to measure the gain; a quarter of six or more by default."""
+    """Runs held out to measure the gain; a quarter of 24 or more by default, and with --against of six."""
     classifier: bool = setting(False)
     """Also train a classifier in simulation, before and after; takes a minute."""
     seed: int = setting(0, "Of the choice of held-out runs, and of the bootstrap.", ge=0)
@@ -174,6 +174,7 @@ def explain(
     from pipelines.report.results import silent
     from terrain.discrepancy.compared import terrains_apart
     from terrain.discrepancy.diagnosed_runs import chosen_runs, diagnose_runs, extended_effects, held_out_gain
+    from terrain.discrepancy.held_out import quarter
     from terrain.discrepancy.next_drive import next_command
     from terrain.discrepancy.powertrain import powertrain_of
     from terrain.discrepancy.robot_terms import in_robot_terms
@@ -190,7 +191,10 @@ def explain(
     library = showing(robot.drive, robot.effects) if names is None else library_of(robot.drive, names)
     parts = cut_long(runs)
     chosen = chosen_runs(parts, robot, asked.terrain)
-    diagnosed = diagnose_runs(chosen, robot, library, asked.hold_out, seed)
+    hold_out = asked.hold_out
+    if hold_out is None and against is not None:  # differences are judged on runs held out of both sets
+        hold_out = quarter(len(chosen))
+    diagnosed = diagnose_runs(chosen, robot, library, hold_out, seed)
     progress("diagnose", 1, 1)
     gained = held_out_gain(diagnosed, robot, seed)
     progress("gain", 1, 1)

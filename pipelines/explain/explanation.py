@@ -132,7 +132,7 @@ def report(result: ExplainResult) -> Report:
     held_out = f"{len(runs.held_out)} more held out to check them" if runs.held_out else ""
     lead = f"{diagnosis.n_runs} runs to find causes", held_out, result.data, result.terrain
     picture = None
-    if shown := runs.whole if runs.held_out else runs.compared:
+    if shown := runs.whole or runs.compared:
         stretch = example_stretch(shown, runs.noise)
         there = measured_channels([stretch])
         of = [each.channel for each in channels_that_matter(result) if each.channel in there]

@@ -22,7 +22,7 @@ from terrain.discrepancy.differences import INDEX, MORE, PARAMETER, difference, 
 from terrain.discrepancy.earned import fit_to_judge
 from terrain.discrepancy.evidence import Evidence, move_point
 from terrain.discrepancy.gain import ratio_of_sums
-from terrain.discrepancy.held_out import HOLD_OUT_EVERY, HOLD_OUT_FROM, repair_held_out
+from terrain.discrepancy.held_out import quarter, repair_held_out
 from terrain.discrepancy.patterns import evidence_of_parts
 from terrain.discrepancy.probes import Z_PROBE, input_values
 from terrain.discrepancy.runs import Excluded, Signals, Simulation, comparable, in_order, low_pass_of
@@ -93,7 +93,7 @@ def compare_with(
     noise = {channel: residual.noise for channel, residual in diagnosis.residual_before.items()}
     second = repair_held_out(signals, diagnosis.faults, last, diagnosed.low_pass, noise)
     second, unfit = fit_to_judge(last, second)
-    n = math.ceil(len(second) / HOLD_OUT_EVERY) if len(second) >= HOLD_OUT_FROM else 0
+    n = quarter(len(second))
     judged = set(np.random.default_rng(seed).permutation(len(second))[:n].tolist())
     used = [run for i, run in enumerate(second) if i not in judged]
     kept = [run for i, run in enumerate(second) if i in judged]

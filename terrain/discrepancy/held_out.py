@@ -20,7 +20,19 @@ from terrain.estimation.estimate import Estimate, estimate_run, summarize
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 
-HOLD_OUT_FROM, HOLD_OUT_EVERY = 6, 4  #: With so many runs or more, one in every so many is held out
+HOLD_OUT_FROM, HOLD_OUT_EVERY = 24, 4
+"""With so many runs or more, one in every so many is held out; of fewer a quarter is too few to judge on."""
+
+
+def quarter(n_runs: int) -> int:
+    """Return how many of runs are a quarter, none of so few that those left would be too few.
+
+    Examples
+    --------
+    >>> quarter(8), quarter(5)
+    (2, 0)
+    """
+    return math.ceil(n_runs / HOLD_OUT_EVERY) if n_runs >= 2 * MIN_RUNS else 0
 
 
 def split_runs(runs: Sequence[RunLog], hold_out: int | None, seed: int) -> tuple[list[RunLog], list[RunLog]]:
@@ -31,7 +43,7 @@ def split_runs(runs: Sequence[RunLog], hold_out: int | None, seed: int) -> tuple
 
     Parameters
     ----------
-    hold_out : number of runs held out, of sessions at least; by default a quarter of six runs or more
+    hold_out : number of runs held out, of sessions at least; by default a quarter of 24 runs or more
     seed : of the order
 
     Raises

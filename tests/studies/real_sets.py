@@ -29,6 +29,7 @@ from terrain.deviation import Deviation
 from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns
 from terrain.discrepancy.gain import HALF
+from terrain.discrepancy.held_out import quarter
 from terrain.discrepancy.learner import ENOUGH
 from terrain.effects import CHANNELS
 from terrain.errors import ConfigError, DataError
@@ -153,7 +154,10 @@ def explain_set(name: str, label: str, runs: Sequence[RunLog], draws: int = 1) -
     runs = relabelled(runs, given[label]) if label in given else list(runs)
     start_s = time.process_time()
     try:
-        result, *more = [terrain.explain(runs, SETS[name].robot, seed=seed) for seed in range(draws)]
+        about = runs, SETS[name].robot
+        result, *more = [
+            terrain.explain(*about, hold_out=quarter(len(runs)), seed=seed) for seed in range(draws)
+        ]
     except DataError as error:
         return Row(name, label, "", str(error), (), *UNKNOWN, np.nan, np.nan, "", np.nan), []
     cpu_s = (time.process_time() - start_s) / draws

@@ -19,7 +19,7 @@ from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
 from pipelines.report.tree import Column, Report, Table
-from terrain.discrepancy.held_out import split_runs
+from terrain.discrepancy.held_out import quarter, split_runs
 from terrain.discrepancy.runs import in_order
 from terrain.discrepancy.watch import BLOCK_S, Block, Status, Watch, Watched, blocks_of, simulation_of
 from terrain.records import RunLog, Stream
@@ -155,7 +155,7 @@ def run(settings: Settings, progress: Progress = silent) -> Watching:
         for run in in_order(load_runs(settings.data, robot=settings.robot))
         if settings.terrain is None or run.terrains == (settings.terrain,)
     ]
-    used, held_out = split_runs(runs, None, settings.seed)
+    used, held_out = split_runs(runs, quarter(len(runs)), settings.seed)
     found = explain(used, settings.robot, seed=settings.seed)
     progress("explain", 1, 1)
     watched, quiet = watched_of(found, settings.data.name)

@@ -26,12 +26,12 @@ def test_the_extended_robot_has_the_latest_value_of_a_trend_and_no_gain_is_claim
 
 def test_a_rogue_run_that_is_held_out_is_named_too_and_judges_nothing(a_run):
     plain = [a_run(i, effects={}) for i in range(N)]
-    _, held_out = split_runs(plain, None, 0)
+    _, held_out = split_runs(plain, 3, 0)
     rogue = held_out[0].run_id
     runs = [
         a_run(i, effects={"wheel_radius_ratio": 0.08 * (run.run_id == rogue)}) for i, run in enumerate(plain)
     ]
-    result = explain(runs, "husky", effects=EFFECTS)
+    result = explain(runs, "husky", effects=EFFECTS, hold_out=3)
     (out,) = result.diagnosis.excluded_runs
     assert out.run_id == rogue
     assert "its wheel radius differs from theirs by" in out.reason

@@ -118,7 +118,7 @@ def test_runs_are_held_out_for_the_gain_and_one_session_a_side_is_stated(hide):
         ]
         for name, hidden, s in (("a", {}, 1), ("b", {"wheel_radius_ratio": -0.06}, 41))
     )
-    diagnosed = diagnose_runs(first, HUSKY, LIBRARY, None, 0)
+    diagnosed = diagnose_runs(first, HUSKY, LIBRARY, 2, 0)
     against = compare_with(diagnosed, HUSKY, second, LIBRARY)
     assert [each.name for each in against.differences] == ["wheel_radius"]
     assert (against.n_runs, against.n_held_out, against.n_sessions) == ((6, 6), 4, (1, 1))

@@ -23,7 +23,7 @@ FEW = tuple(map(effect_named, ("camera_yaw", "lever_arm", "gyro_scale", "effecti
 YAW = {"camera_yaw_rad": 0.05}
 
 
-def diagnosed(runs, hold_out=None, library=FEW, robot=HUSKY):
+def diagnosed(runs, hold_out=2, library=FEW, robot=HUSKY):
     return diagnose_runs(runs, robot, library, hold_out, 0)
 
 
@@ -41,7 +41,7 @@ def turned(hide):
 def planted(hide, name, value):
     """Return runs of which those that are held out have the opposite of what the others have."""
     runs, other = (hide({name: sign * value}, n=8, duration_s=20.0) for sign in (1, -1))
-    ids = {run.run_id for run in split_runs(runs, None, 0)[1]}
+    ids = {run.run_id for run in split_runs(runs, 2, 0)[1]}
     return [there if run.run_id in ids else run for run, there in zip(runs, other, strict=True)]
 
 
@@ -98,7 +98,7 @@ def test_a_set_extends_the_simulation_by_its_best_member_and_gains(hide):
 
 def test_parts_of_few_runs_are_left_out_in_turn_and_what_was_built_in_gains_on_all(turned):
     few = turned[:4]
-    by_parts = diagnose(few, diagnosed(few).simulation, FEW)
+    by_parts = diagnose(few, diagnosed(few, None).simulation, FEW)
     assert [cause.name for cause in by_parts.causes] == ["camera_yaw"]
     assert by_parts.gain.how == "4 runs, runs of them left out of the fit in turn"
     held = diagnosed(turned)
@@ -106,7 +106,7 @@ def test_parts_of_few_runs_are_left_out_in_turn_and_what_was_built_in_gains_on_a
     assert ahead == pytest.approx(beside, abs=0.1)
     effects = dict(YAW)
     extended = replace(HUSKY, effects=effects, effects_cov=np.array([[1e-6]]))
-    again = diagnosed(few, robot=extended)
+    again = diagnosed(few, None, robot=extended)
     assert (again.diagnosis.causes, again.extended) == ((), None)
     gain = held_out_gain(again, extended, 0).built_in_before
     assert len(gain.runs) == 4

@@ -82,19 +82,19 @@ def test_no_gain_is_claimed_for_nothing_for_the_wrong_sign_or_where_nothing_is_h
 
 
 def test_the_seed_chooses_the_runs_held_out_and_no_label_does():
-    runs = [RunLog(f"{name}{i}", "husky", {}, ((0.0, 1.0, name),)) for name in "ab" for i in range(8)]
+    runs = [RunLog(f"{name}{i}", "husky", {}, ((0.0, 1.0, name),)) for name in "ab" for i in range(12)]
     used, held = split_runs(runs, None, 0)
-    assert len(held) == 4
+    assert len(held) == 6
     for labels in ((), ((0.0, 1.0, "grass"),)):
         others = [replace(run, labels=labels if i % 3 else ()) for i, run in enumerate(runs)]
         assert [run.run_id for run in split_runs(others, None, 0)[1]] == [run.run_id for run in held]
     assert {run.run_id for run in used} | {run.run_id for run in held} == {run.run_id for run in runs}
     assert split_runs(runs, None, 0) == (used, held)
     assert any(split_runs(runs, None, seed)[1] != held for seed in range(1, 4))
-    assert split_runs(runs[:5], None, 0) == (runs[:5], [])
+    assert split_runs(runs[:23], None, 0) == (runs[:23], [])
     assert split_runs(runs, 0, 0) == (runs, [])
-    with pytest.raises(DataError, match="--hold-out is 14 of 16"):
-        split_runs(runs, 14, 0)
+    with pytest.raises(DataError, match="--hold-out is 22 of 24"):
+        split_runs(runs, 22, 0)
 
 
 @pytest.mark.parametrize("n_sessions", [2, 3, 8])
@@ -102,12 +102,12 @@ def test_the_seed_chooses_the_runs_held_out_and_no_label_does():
 def test_whole_sessions_are_held_out_where_several_are_named(n_sessions, hold_out):
     runs = [
         RunLog(f"r{i}", "husky", {}, ((0.0, 1.0, "ab"[i % 2]),), session=f"session {i % n_sessions}")
-        for i in range(16)
+        for i in range(24)
     ]
     used, held = split_runs(runs, hold_out, 1)
     assert {run.session for run in used}.isdisjoint(run.session for run in held)
     assert len(held) >= (hold_out or 2)
-    assert len(used) + len(held) == 16
+    assert len(used) + len(held) == 24
 
 
 def test_a_fault_is_repaired_in_the_held_out_runs_that_have_it():
