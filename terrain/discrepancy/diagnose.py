@@ -20,7 +20,14 @@ import numpy as np
 from terrain.discrepancy import constancy, verdict
 from terrain.discrepancy.clocks import latencies_of, shifts_of
 from terrain.discrepancy.earned import MIN_RUNS, OUTWEIGHS, HeldOut, Judgement, crossed_runs, judge
-from terrain.discrepancy.evidence import EXCITED_RATIO, Z_EFFECT, Evidence, move_point, partial_information
+from terrain.discrepancy.evidence import (
+    EXCITED_RATIO,
+    Z_EFFECT,
+    Evidence,
+    WaldTest,
+    move_point,
+    partial_information,
+)
 from terrain.discrepancy.gain import THIRDS, earned
 from terrain.discrepancy.health.fault import Fault, repaired
 from terrain.discrepancy.health.faults import faults_of
@@ -422,12 +429,20 @@ def _withdraw_wrong(problem: Problem, fit: CauseFit, withdrawn: dict[str, verdic
         doubtful = [cause for cause in fit.causes if cause.name in reasons]
         worst = first(doubtful, key=lambda cause: raw_gain(fit, cause))
         left = _withdraw(problem, fit, worst, reasons[worst.name], withdrawn)
-        more = search_on(problem._replace(barred=frozenset(withdrawn)), left.info, left.causes)
-        if {*more.causes} != {*left.causes}:
-            with_it, without = (fit_again(problem, fit.info, names_of(e.causes))[0] for e in (fit, more))
-            left = more if without - with_it < RIVAL_LOSS * fit.tests[worst.name].inflation else left
+        came = [e.name for e in problem.candidates if _took_the_place(fit.tests[e.name], left.tests[e.name])]
+        if came:
+            barred = frozenset({effect.name for effect in problem.library} - {*came} | {*withdrawn})
+            more = search_on(problem._replace(barred=barred), left.info, left.causes)
+            with_it, without = (fit_again(problem, fit.info, each.names)[0] for each in (fit, more))
+            if without - with_it < RIVAL_LOSS * fit.tests[worst.name].inflation:
+                left = more
         fit = left
     return fit
+
+
+def _took_the_place(beside: WaldTest, without: WaldTest) -> bool:
+    """Return whether an effect is significant without a cause, beside which it had less than half of its gain."""
+    return without.significant and float(beside.gain.sum()) < 0.5 * float(without.gain.sum())
 
 
 def _withdraw_varying(
