@@ -290,7 +290,10 @@ def _learned_terms(result: ExplainResult) -> tuple[list[LearnedTerm], list[Learn
 def _how_certain(result: ExplainResult) -> str:
     """Return the intervals of what is built in, the candidates, and what these drives could not have shown."""
     diagnosis, parts = result.diagnosis, []
-    for tier, words in ((Tier.NAMED, "confirmed on held-out runs"), (Tier.SET, "confirmed as one of a set")):
+    for tier, words in (
+        (Tier.NAMED, "confirmed on runs left out of the fit"),
+        (Tier.SET, "confirmed as one of a set"),
+    ):
         values = [
             f"{effect_label(cause.name)} "
             + enumerated([value_in_robot_terms(*v[:2], *v[3:], result.robot) for v in _clear(cause)])
@@ -369,7 +372,7 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
         yield Text(f"Runs that were excluded as unfit: {_ids(diagnosis.excluded_runs)}.", "warning")
     causes: list[tuple[Any, ...]] = []
     notes = [
-        "Of each cause the part of the squared error that it removes in the channels where it acts, on runs held out."
+        "The squared error removed is that of the channels where the cause acts, on runs left out of the fit."
     ]
     for cause in diagnosis.built_in:
         label = effect_label(cause.name)
