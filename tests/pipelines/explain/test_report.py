@@ -88,8 +88,8 @@ def test_the_first_screen_answers_what_why_how_certain_what_for_and_what_next(ex
     for stated in (
         "What is wrong The simulated speed ahead is off by 0.02 m/s rms",
         "Why The measured point 0.45 m ahead and 0.05 m right of the centre",
-        "How certain Confirmed on runs left out of the fit, with 95 % intervals: lever arm 0.45 m (0.44 to 0.46) and -50 mm "
-        "(-60 to -40 mm)",
+        "How certain Confirmed on runs left out of the fit, with 95 % intervals: lever arm 0.45 m (0.44 to 0.46) and "
+        "-50 mm (-60 to -40 mm)",
         "What it gains Against the simulation as it is, on 2 runs held out: over all channels named causes remove 50 % "
         "(40 to 60 %); a black-box learner would remove 76 % (70 to 80 %)",
         "What next Simulate and estimate with extended.yaml in place of the robot's file",
