@@ -239,11 +239,14 @@ def judge(fit: CauseFit, built: Sequence[Effect], on: HeldOut) -> Judgement:
 
     A cause earns its name where the part of the square that goes with it, over what the others leave that are refitted
     without it, has its interval above 0, where the extension removes at least half of what the learner does over the
-    channels where the cause acts, and where it makes no channel worse.  That part is of the squares themselves, or by
-    how much likelier the runs are (:func:`likelier_with`), whichever interval is narrower: of what changes little the
-    noise of all else, and what varies from run to run, hide the first.
+    channels where the cause acts, and where it makes no channel worse.
 
-    Where runs are so few that their thirds are the clusters, causes are judged together: where the second interval of
+    Where the squares gain something, but not with their interval, that part is by how much likelier the runs are
+    (:func:`likelier_with`): of what changes little the noise of all else, and what varies from run to run, hide it.
+    A part of the square is needed for that (:data:`WORSE`), and no more than all: two causes that make up for
+    each other gain more.
+
+    Where runs are so few that their thirds are the clusters, causes are judged together by that: where the interval of
     all of them is above 0, one is dropped only if the runs do not show it by themselves, the interval of the part of
     its change that they have holding 0, or are no likelier with it.  What varies from run to run is the same in thirds
     of one, so that these do not show that a channel gets worse.
@@ -267,13 +270,12 @@ def judge(fit: CauseFit, built: Sequence[Effect], on: HeldOut) -> Judgement:
         main = [name for name in order if acts[CHANNELS.index(name)]]
         changed = part.changes >= np.maximum(SHARE * whole, 1e-30)
         acting[cause.name] = tuple(n for n in order if n in gain.channels and changed[CHANNELS.index(n)])
-        by_square = part.gain(weights * acts, on.seed)
-        size = part.size(weights * acts)
+        ratio, interval = part.gain(weights * acts, on.seed)
         likelier, ends = likelier_with(info, of_parts, rest, on, runs)
-        by_evidence = size * likelier, (size * ends[0], size * ends[1])
-        both = [by_evidence] if together else [by_square, by_evidence]
-        ratio, (low, high) = min(both, key=lambda gain: gain[1][1] - gain[1][0])
-        ratio, interval = removed[cause.name] = min(ratio, 1.0), (low, min(high, 1.0))
+        if together or (interval[0] <= 0.0 and WORSE < ratio <= 1.0):
+            size = part.size(weights * acts)
+            ratio, interval = min(size * likelier, 1.0), (size * ends[0], min(size * ends[1], 1.0))
+        removed[cause.name] = ratio, interval
         own_gain, learner, _ = gains_of(squares @ (weights * acts), True, on.seed)
         words = " and ".join([CHANNEL_WORDS[name][0] for name in main])
         net = float(((part.squares[:, 1] - part.squares[:, 2]).sum(axis=0) * weights).sum())

@@ -187,7 +187,7 @@ def with_loss(run, robot):
 def test_a_law_outside_the_catalogue_comes_back_in_the_extended_robot_and_its_simulation(tmp_path, hide):
     robot = load_robot("husky")
     runs = [with_loss(run, robot) for run in hide({}, n=12)]
-    found = explain(runs, robot, effects=("effective_track", "wheel_radius"))
+    found = explain(runs, robot, effects=("effective_track", "wheel_radius"), hold_out=3)
     (gain,) = [each for each in found.diagnosed.learned_gains if each.channel == "speed_x_mps"]
     assert gain.reduction > max(0.8, 0.9 * gain.learner_reduction)
     assert "speed lost" in gain.says
