@@ -56,9 +56,9 @@ SHARE = 0.25
 """It is stated beside a channel of which it makes at least that part of the change by all causes, root mean square."""
 
 WORSE, OUTWEIGHS = 0.02, 10.0
-"""Part of the square of a channel by which a cause makes it worse, and how many times that, over the noise, it has to
-remove from the others all the same: a channel that is wrong by itself, as currents of a turning resistance that is not
-known, hardly speaks against a track that takes the error of three others."""
+"""Part of the square of a channel by which a cause makes it worse, or better at all; and how many times that, over the
+noise, it has to remove from the others all the same: a channel that is wrong by itself, as currents of a turning
+resistance that is not known, hardly speaks against a track that takes the error of three others."""
 
 
 def units_of(runs: Sequence[RunLog] | Sequence[Signals] | Sequence[ComparedRun]) -> list[str]:
@@ -241,10 +241,9 @@ def judge(fit: CauseFit, built: Sequence[Effect], on: HeldOut) -> Judgement:
     without it, has its interval above 0, where the extension removes at least half of what the learner does over the
     channels where the cause acts, and where it makes no channel worse.
 
-    Where the squares gain something, but not with their interval, that part is by how much likelier the runs are
-    (:func:`likelier_with`): of what changes little the noise of all else, and what varies from run to run, hide it.
-    A part of the square is needed for that (:data:`WORSE`), and no more than all: two causes that make up for
-    each other gain more.
+    Where the squares gain more than :data:`WORSE`, but not with their interval, that part is by how much likelier the
+    runs are (:func:`likelier_with`): noise of all else, and what varies from run to run, hide a small change.  Two
+    causes that make up for each other gain more than all there is.
 
     Where runs are so few that their thirds are the clusters, causes are judged together by that: where the interval of
     all of them is above 0, one is dropped only if the runs do not show it by themselves, the interval of the part of
@@ -271,15 +270,16 @@ def judge(fit: CauseFit, built: Sequence[Effect], on: HeldOut) -> Judgement:
         changed = part.changes >= np.maximum(SHARE * whole, 1e-30)
         acting[cause.name] = tuple(n for n in order if n in gain.channels and changed[CHANNELS.index(n)])
         ratio, interval = part.gain(weights * acts, on.seed)
-        likelier, ends = likelier_with(info, of_parts, rest, on, runs)
-        if together or (interval[0] <= 0.0 and WORSE < ratio <= 1.0):
-            size = part.size(weights * acts)
+        confirmed = interval[0] > 0.0
+        if together or (not confirmed and WORSE < ratio <= 1.0):
+            (likelier, ends), size = likelier_with(info, of_parts, rest, on, runs), part.size(weights * acts)
             ratio, interval = min(size * likelier, 1.0), (size * ends[0], min(size * ends[1], 1.0))
+            confirmed = likelier > 0.0 and ends[0] > -1.0 if together else ends[0] > 0.0
         removed[cause.name] = ratio, interval
         own_gain, learner, _ = gains_of(squares @ (weights * acts), True, on.seed)
         words = " and ".join([CHANNEL_WORDS[name][0] for name in main])
         net = float(((part.squares[:, 1] - part.squares[:, 2]).sum(axis=0) * weights).sum())
-        if not (likelier > 0.0 and ends[0] > -1.0 if together else interval[0] > 0.0):
+        if not confirmed:
             reasons[cause.name] = f"{_percent(ratio, interval)} of the square of {words} go with it"
         elif own_gain[0] < HALF * learner[0]:
             beside = f"a black-box learner removes {100 * learner[0]:.0f} %"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from studies.real_sets import whole_rows
 
+from pipelines.explain.explanation import five_questions
 from pipelines.explain.figures import dependence_figures, parts_figure, run_figure, spectra_figure
 from pipelines.report.numbers import NOT_KNOWN
 from pipelines.report.terminal import terminal_text
@@ -13,9 +14,11 @@ from terrain.discrepancy import verdict
 from terrain.discrepancy.diagnosed_runs import HeldOutGain
 from terrain.discrepancy.gain import Gain
 from terrain.discrepancy.held_out import Change, Comparison
+from terrain.discrepancy.learner import LearnedGain
 from terrain.discrepancy.patterns import Kind
 from terrain.discrepancy.runs import Excluded, measured_channels
 from terrain.discrepancy.verdict import Clock
+from terrain.learned_term import LearnedTerm
 from terrain.robots import load_robot
 
 HUSKY = load_robot("husky")
@@ -114,6 +117,19 @@ def test_a_channel_that_nothing_explains_leads_where_nothing_is_explained(explai
     two = explained(a_gain(), channels=(open_._replace(channel="current_a"), AHEAD), causes=(LEVER_ARM,))
     assert two.report.answer.startswith("The simulated speed ahead")
     assert "No known cause for sum of the motor currents" in text_of(two)
+
+
+def test_what_was_learned_is_no_reason_where_it_is_no_better_on_runs_held_out(explained):
+    values = np.array([-0.1]), np.array([[1e-4]]), {"speed_mps": (0.0, 1.0)}
+    term = LearnedTerm("speed_x_mps", ("speed_mps",), *values, says="speed lost")
+    for reduction, is_better in ((0.7, True), (0.5, False)):
+        result = explained(a_gain(), channels=(AHEAD,))
+        gains = (LearnedGain("speed_x_mps", term.says, 0.5, reduction, (-0.1, 0.3), 0.8),)
+        with_terms = replace(result.diagnosed.with_terms, learned=(term,))
+        diagnosed = replace(result.diagnosed, with_terms=with_terms, learned_gains=gains)
+        why, how_certain = (row[1] for row in five_questions(replace(result, diagnosed=diagnosed)).rows[1:3])
+        assert ("learned: speed lost" in why) == is_better
+        assert ("what was learned of speed ahead" in how_certain) != is_better
 
 
 FILTER = Comparison("vio12", None, 2, {"speed_mps": Change(0.1, 0.05, (-0.06, -0.04))})

@@ -224,17 +224,36 @@ def test_what_a_withdrawn_cause_makes_is_unexplained_if_it_is_a_part_of_its_chan
     assert not diagnose(runs, world.simulation).unexplained
 
 
+def without_camera(world, hidden):
+    """Runs without camera, heading and currents: a gyro's scale and an effective track are one and the same."""
+    runs = []
+    for run in world.runs(hidden):
+        wheels = run.streams["wheels"]
+        speeds = Stream(wheels.time_s, wheels.values[:, :2], wheels.channels[:2])
+        runs.append(replace(run, streams={"wheels": speeds, "imu": run.streams["imu"]}))
+    return runs
+
+
+def test_an_effect_comes_in_whose_place_a_cause_took_that_is_withdrawn(worlds, monkeypatch):
+    world, withdrawn = worlds("husky"), []
+
+    def once(problem, fit, probes):
+        reasons = {} if withdrawn else {cause.name: "it cannot be" for cause in fit.causes}
+        withdrawn.extend(reasons)
+        return reasons
+
+    monkeypatch.setattr(diagnose_module, "reasons_to_withdraw", once)
+    library = [effect_named(name) for name in ("gyro_scale", "effective_track")]
+    diagnosis = diagnose(without_camera(world, {"gyro_scale_ratio": 0.065}), world.simulation, library)
+    assert len(withdrawn) == 1
+    assert {cause.name for cause in diagnosis.built_in} == {effect.name for effect in library} - {*withdrawn}
+
+
 def test_exact_twins_are_ambiguous_and_the_channel_that_distinguishes_them_is_named(worlds):
-    """Without camera, heading and currents a gyro's scale and an effective track are one and the same."""
     world = worlds("husky")
 
     def diagnosed(ratio):
-        runs = []
-        for run in world.runs({"gyro_scale_ratio": ratio}):
-            wheels = run.streams["wheels"]
-            speeds = Stream(wheels.time_s, wheels.values[:, :2], wheels.channels[:2])
-            runs.append(replace(run, streams={"wheels": speeds, "imu": run.streams["imu"]}))
-        return diagnose(runs, world.simulation)
+        return diagnose(without_camera(world, {"gyro_scale_ratio": ratio}), world.simulation)
 
     diagnosis = diagnosed(0.065)
     assert (diagnosis.verdict, named(diagnosis)) == (Tier.SET, [])
