@@ -215,7 +215,7 @@ def five_questions(result: ExplainResult) -> Pairs:
         sensors[what] = [*sensors.get(what, ()), *filter(None, [sensor])]
     wrong = [f"{what}{f'{BY}{enumerated(by)}' if by else ''}" for what, by in sensors.items()]
     if more := [f"{CHANNEL_WORDS[of.channel][0]} ({_rms(of)})" for of in channels[STATED:]]:
-        wrong.append(f"smaller errors: {enumerated(more)}")
+        wrong.append(f"also off: {enumerated(more)}")
     rows = [
         ("What is wrong", _sentences(wrong) or "Nothing that these runs show."),
         ("Why", _why(result)),
