@@ -16,7 +16,7 @@ from terrain.discrepancy.constancy import PartValues, part_values, rogues_among
 from terrain.discrepancy.diagnose import Found, check_ids, find_causes, judged, statement_of
 from terrain.discrepancy.earned import MIN_RUNS, crossed_runs, held_out_runs, units_of
 from terrain.discrepancy.gain import Gain
-from terrain.discrepancy.grounds import is_better, simulation_for
+from terrain.discrepancy.grounds import few_of, is_better, on_soils, simulation_for
 from terrain.discrepancy.held_out import Comparison, filter_gain, repair_held_out, split_runs
 from terrain.discrepancy.learner import (
     Learned,
@@ -173,26 +173,32 @@ def found_on_ground(
 ) -> tuple[Found, Simulation, tuple[TerrainMatch, ...]]:
     """Return what was found on the soils of the labels, or on the default ground, and the terrain of each label.
 
-    With what is named on it a soil has to leave clearly less of the runs behind the fit than the default ground does.
+    With what is found on them soils have to leave clearly less of the runs behind the fit than the default ground, or
+    less by fewer causes.  Of many runs some decide.
     """
     simulation, terrains = simulation_for(runs, robot, library, signals)
     found = find_causes(runs, simulation, library, signals)
-    if not any(match.soil for match in terrains):
+    on_soil, on_labels = on_soils(runs, simulation, library, signals)
+    if not any(match.soil for match in on_labels):
         return found, simulation, terrains
-    plain, on_default = simulation_for(runs, robot, library, signals, on_soils=False)
-    other = find_causes(runs, plain, library, signals)
-    noise = np.array([other.noise.get(name, np.inf) for name in CHANNELS])
+    few = few_of(range(len(runs)))
+    some = [runs[i] for i in few], [signals[i] for i in few]
+    every = len(few) == len(runs)
+    one = found if every else find_causes(some[0], simulation, library, some[1])
+    other = find_causes(some[0], on_soil, library, some[1])
+    noise = np.array([one.noise.get(name, np.inf) for name in CHANNELS])
 
     def left_by(each: Found) -> dict[str, float]:
         compared = compare_runs(each.extended, None, each.problem.signals, each.problem.low_pass)
         return {run.run_id: float(np.nansum((run.residual(False) / noise) ** 2)) for run in compared}
 
-    on_soils, without = left_by(found), left_by(other)
-    both = [run for run in other.problem.signals if run.run_id in on_soils]
-    loss, loss_without = (np.array([left[run.run_id] for run in both]) for left in (on_soils, without))
-    if is_better(loss, loss_without, units_of(both)):
+    without, left = left_by(one), left_by(other)
+    both = [run for run in one.problem.signals if run.run_id in left]
+    loss, loss_without = (np.array([of[run.run_id] for run in both]) for of in (left, without))
+    fewer = len(other.fit.causes) < len(one.fit.causes) and loss.sum() < loss_without.sum()
+    if not (fewer or is_better(loss, loss_without, units_of(both))):
         return found, simulation, terrains
-    return other, plain, on_default
+    return other if every else find_causes(runs, on_soil, library, signals), on_soil, on_labels
 
 
 def held_out_gain(diagnosed: DiagnosedRuns, robot: Robot, seed: int) -> HeldOutGain:

@@ -271,12 +271,12 @@ def judge(fit: CauseFit, built: Sequence[Effect], on: HeldOut) -> Judgement:
         acting[cause.name] = tuple(n for n in order if n in gain.channels and changed[CHANNELS.index(n)])
         ratio, interval = part.gain(weights * acts, on.seed)
         confirmed = interval[0] > 0.0
-        if together or (not confirmed and WORSE < ratio <= 1.0):
+        own_gain, learner, left = gains_of(squares @ (weights * acts), True, on.seed)
+        if together or (not confirmed and (left[0] <= 0.0 or WORSE < ratio <= 1.0)):
             (likelier, ends), size = likelier_with(info, of_parts, rest, on, runs), part.size(weights * acts)
             ratio, interval = min(size * likelier, 1.0), (size * ends[0], min(size * ends[1], 1.0))
             confirmed = likelier > 0.0 and ends[0] > -1.0 if together else ends[0] > 0.0
         removed[cause.name] = ratio, interval
-        own_gain, learner, _ = gains_of(squares @ (weights * acts), True, on.seed)
         words = " and ".join([CHANNEL_WORDS[name][0] for name in main])
         net = float(((part.squares[:, 1] - part.squares[:, 2]).sum(axis=0) * weights).sum())
         if not confirmed:

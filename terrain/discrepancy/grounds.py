@@ -1,11 +1,10 @@
 """The simulation that runs are compared with: on which ground the runs of each label are simulated.
 
-A label is a hypothesis.  The soil of the package of that name competes with the default ground, and is taken where
-runs left out of the fit are predicted clearly better on it while everything that the library may change, within its
-plausible range, is fitted with both.  Ties go to the default ground, so that a label by itself changes nothing.  With
-what is named on either the soil has to be clearly better, too
-(:func:`terrain.discrepancy.diagnosed_runs.found_on_ground`): where thirty parameters repair a soil and no few do, it is
-not that of the runs.
+A label is a hypothesis.  The soil of the package of that name competes with the default ground once causes are found on
+both (:func:`terrain.discrepancy.diagnosed_runs.found_on_ground`): it is taken where the runs behind the fit are
+clearly nearer to it, each with what was found on it, or nearer at all while fewer causes are.  Ties go to the default
+ground, so that a label by itself changes nothing.  What many parameters together could make of a ground does not
+count: on the default one they repair the slip of most soils.
 
 On any ground a part of the measured tilt acts as a slope: a tilt that is none, of a body that rides over bumps, takes
 no traction; simulated as a slope it biases mass, resistance and slip.
@@ -18,9 +17,9 @@ ranges that fits the runs of the other folds best.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -39,52 +38,90 @@ from terrain.files.names import packaged
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 from terrain.simulation.plants.planar import Ground, planar_ground, probe_error, spread_numbers
-from terrain.terramechanics.soil import EXTRA, Soil, load_soil, soil_names
+from terrain.terramechanics.soil import EXTRA, load_soil, soil_names
+
+T = TypeVar("T")
 
 MAX_RUNS = 16
-"""Runs of a label by which its ground is chosen, evenly spaced: more tell no better what all of them have in common."""
+"""Runs by which a ground is chosen, evenly spaced: more tell no better what all of them have in common."""
 
 N_FOLDS = 6  #: Of runs; each is predicted by a fit to the others
 #: Gauss-Newton steps of the whole library: sensitivities at twice the track are others than at once.
 N_STEPS = 2
 
 Z_GROUND, LEAST_FALL = 2.33, 0.1
-"""A soil, or a part of the tilt, is taken from that evidence on (one in a hundred by chance), clustered by session or
-run, and from that ratio of the held-out loss.  Runs of the dynamic simulation have 0.4 to 0.7 by their own soil, 0.003
-at most by another."""
+"""A soil, or a part of the tilt, is clearly better from that evidence on (one in a hundred by chance), of the logarithm
+of the loss of sessions or runs, and from a loss that is less by that ratio."""
+
+NEAR = 1.5
+"""Ratio of the loss of runs on a soil, nothing fitted, over that on the default ground, to which causes are looked for
+on the soil, too."""
 
 RATIOS = (0.0, 0.5, 1.0)
-"""Parts of the tilt that are tried.  All of it acts, unless one of the others is as clearly better as a soil has to be:
-then that at the least of the parabola through their losses."""
+"""Parts of the tilt that are tried.  On the default ground all of it acts unless one of the others is clearly better,
+on a soil, which has to prove itself, that at the least of the parabola through their losses."""
 
 
 def simulation_for(
+    runs: Sequence[RunLog], robot: Robot, library: Sequence[Effect], signals: Sequence[Signals] | None = None
+) -> tuple[Simulation, tuple[TerrainMatch, ...]]:
+    """Return the simulation of runs on the default ground, with the part of the tilt that acts in those of each label.
+
+    The ``signals`` of the runs are taken where they are known already.
+    """
+    simulation = Simulation(robot, Ground(), robot.effects, spread_numbers("scatter"), learned=robot.learned)
+    grounds = {
+        label: tilted(own, simulation, library, simulation.ground)
+        for label, own in by_label(runs, robot, signals).items()
+        if own
+    }
+    return on_grounds(simulation, by_label(runs, robot, signals), grounds, ())
+
+
+def on_soils(
     runs: Sequence[RunLog],
-    robot: Robot,
+    given: Simulation,
     library: Sequence[Effect],
     signals: Sequence[Signals] | None = None,
-    on_soils: bool = True,
 ) -> tuple[Simulation, tuple[TerrainMatch, ...]]:
-    """Return the simulation of runs, and the terrain that each of their labels is simulated on.
+    """Return a simulation of runs on the soils of those labels that are no further from the runs than its own ground.
 
-    The ``signals`` of the runs are taken where they are known already; without ``on_soils`` no label is a soil.
+    That is without anything fitted: what many parameters together make of a ground says little about it.
     """
-    labels = sorted({run.terrains[0] if len(run.terrains) == 1 else "" for run in runs})
-    scatter = spread_numbers("scatter")
-    simulation = Simulation(robot, Ground(), robot.effects, scatter, learned=robot.learned)
-    known = {*soil_names(), *packaged(EXTRA)} if on_soils else set()
+    robot, labels = given.robot, by_label(runs, given.robot, signals)
+    known, grounds, soils = {*soil_names(), *packaged(EXTRA)}, dict(given.grounds), []
+    for label, own in labels.items():
+        if not (own and label in known and drivable(robot, label)):
+            continue
+        soil = tilted(own, given, library, planar_ground(robot, load_soil(label)))
+        some, low_pass = few_of(own), low_pass_of(own)
+        plain = evidence_at(some, given, given.vector, (), low_pass)
+        tried = replace(given, grounds={label: soil})
+        about = {"noise": plain.noise, "scatter": plain.scatter}
+        beside = evidence_at(some, tried, given.vector, (), low_pass, **about)
+        if log_ratio(beside.c, plain.c).mean() > -math.log(NEAR):
+            grounds[label] = soil
+            soils.append(label)
+    return on_grounds(given, labels, grounds, soils)
+
+
+def by_label(
+    runs: Sequence[RunLog], robot: Robot, signals: Sequence[Signals] | None
+) -> dict[str, list[Signals]]:
+    """Return the signals of runs by their label, empty where they have several."""
     every = [signals_of(run, robot) for run in runs] if signals is None else signals
-    grounds, soils = {}, set()
-    for label in labels:
-        own = [run for run in every if run.terrain == label]
-        soil = load_soil(label) if own and label in known and drivable(robot, label) else None
-        if own:
-            grounds[label], is_soil = ground_of(own, simulation, library, soil)
-            soils |= {label} if is_soil else set()
+    labels = sorted({run.terrains[0] if len(run.terrains) == 1 else "" for run in runs})
+    return {label: [run for run in every if run.terrain == label] for label in labels}
+
+
+def on_grounds(
+    simulation: Simulation, labels: Iterable[str], grounds: Mapping[str, Ground], soils: Collection[str]
+) -> tuple[Simulation, tuple[TerrainMatch, ...]]:
+    """Return a simulation on the ground of each label, of which some are soils, and the terrain of each."""
     grounds = {label: ground for label, ground in grounds.items() if ground != simulation.ground}
     if soils:
         # on soils the simulation has an error of its own
-        parameters = parameters_of(robot.drive)
+        parameters = parameters_of(simulation.robot.drive)
         errors: dict[str, Any] = {"probe_error": probe_error()}
         for kind in ("model_error", "varied_error", "varied_scatter"):
             errors[kind] = {n: size for n, size in spread_numbers(kind).items() if n in parameters}
@@ -95,54 +132,42 @@ def simulation_for(
     )
 
 
-def ground_of(
-    signals: Sequence[Signals], simulation: Simulation, library: Sequence[Effect], soil: Soil | None = None
-) -> tuple[Ground, bool]:
-    """Return the ground of runs of one label, with the part of the tilt that acts, and whether it is the soil."""
-    default = simulation.ground
-    tilts = any(np.nanmax(np.abs([run.grade_rad, run.roll_rad]), initial=0.0) > 0.0 for run in signals)
-    if soil is None and not tilts:
-        return default, False
-    runs = [signals[i] for i in np.unique(np.linspace(0, len(signals) - 1, MAX_RUNS).round().astype(int))]
-    names, low_pass, start = names_of(library), low_pass_of(runs), simulation.vector
-    units = [run.session or run.run_id for run in runs]
+def few_of(runs: Sequence[T]) -> list[T]:
+    """Return at most :data:`MAX_RUNS` of runs."""
+    return [runs[i] for i in np.unique(np.linspace(0, len(runs) - 1, MAX_RUNS).round().astype(int))]
 
-    def on(ground: Ground, point: Array, **about: Any) -> Evidence:
-        tried = replace(simulation, ground=ground)
+
+def tilted(
+    signals: Sequence[Signals], simulation: Simulation, library: Sequence[Effect], ground: Ground
+) -> Ground:
+    """Return a ground with the part of the tilt that acts in runs, of which all that a library has is fitted."""
+    if not any(np.nanmax(np.abs([run.grade_rad, run.roll_rad]), initial=0.0) > 0.0 for run in signals):
+        return ground
+    runs, names, start = few_of(signals), names_of(library), simulation.vector
+    low_pass, point = low_pass_of(runs), start
+    about: dict[str, Any] = {}
+
+    def on(ratio: float) -> Evidence:
+        tried = replace(simulation, grounds={}, ground=ground._replace(effective_ratio=ratio))
         return evidence_at(runs, tried, point, names, low_pass, **about).counted_from(start)
 
-    def fitted(ground: Ground, **about: Any) -> Array:
-        """Return the point at which the whole library fits best."""
-        point = start
-        for _ in range(N_STEPS):
-            info = on(ground, point, **about)
-            change = within(info.a.sum(axis=0), info.g.sum(axis=0), *ranges_of(info, simulation.effects))
-            point = move_point(start, info.names, change)
-        return point
+    for _ in range(N_STEPS):
+        info = on(1.0)
+        change = within(info.a.sum(axis=0), info.g.sum(axis=0), *ranges_of(info, simulation.effects))
+        point = move_point(start, info.names, change)
+    measure = on(1.0)
+    about = {"noise": measure.noise, "scatter": measure.scatter}  # of all alike
+    losses = np.array([held_out_losses(on(ratio), simulation.effects) for ratio in RATIOS])
+    least = losses[int(np.argmin(losses.sum(axis=1)))]
+    default = ground == simulation.ground
+    if default and not is_better(least, losses[-1], [run.session or run.run_id for run in runs]):
+        return ground
+    return ground._replace(effective_ratio=best_ratio(losses.sum(axis=1)))
 
-    point = fitted(default)
-    measure = on(default, point)
-    about = {"noise": measure.noise, "scatter": measure.scatter}  # of all grounds alike
 
-    def best_of(ground: Ground, info: Evidence, point: Array) -> tuple[Ground, Array]:
-        """Return a ground with the part of the tilt that acts, and its held-out losses."""
-        losses = [held_out_losses(info, simulation.effects)]
-        if tilts:
-            others = [ground._replace(effective_ratio=ratio) for ratio in RATIOS[:-1]]
-            losses[:0] = [held_out_losses(on(each, point, **about), simulation.effects) for each in others]
-            least = min(losses, key=np.sum)
-            if is_better(least, losses[-1], units):
-                return ground._replace(effective_ratio=best_ratio(np.sum(losses, axis=1))), least
-        return ground, losses[-1]
-
-    default, loss = best_of(default, measure, point)
-    if soil is not None:
-        ground = planar_ground(simulation.robot, soil)
-        point = fitted(ground, **about)
-        ground, other = best_of(ground, on(ground, point, **about), point)
-        if is_better(other, loss, units):
-            return ground, True
-    return default, False
+def log_ratio(loss: Array, other: Array) -> Array:
+    """Return the logarithm (n,) of another loss of runs over theirs: above 0 where theirs is less."""
+    return np.asarray(np.log(np.maximum(other, 1e-12) / np.maximum(loss, 1e-12)))
 
 
 def is_better(loss: Array, other: Array, units: Sequence[str]) -> bool:
@@ -155,8 +180,8 @@ def is_better(loss: Array, other: Array, units: Sequence[str]) -> bool:
     (True, False)
     """
     of = np.unique(units, return_inverse=True)[1]
-    gain = np.bincount(of, weights=other - loss)
-    if len(gain) < 2 or not gain.sum() > LEAST_FALL * other.sum():
+    gain = np.bincount(of, weights=log_ratio(loss, other)) / np.bincount(of)
+    if len(gain) < 2 or not gain.mean() > -math.log(1.0 - LEAST_FALL):
         return False
     t = gain.mean() / max(float(gain.std(ddof=1)), 1e-12) * math.sqrt(len(gain))
     return z_of_t(float(t), len(gain) - 1.0) > Z_GROUND

@@ -8,7 +8,6 @@ from studies.blind_trials.drives import rich_drives
 from studies.blind_trials.trial import hidden_runs
 from studies.foreign.worlds import WORLDS, driven_by, runs_of
 
-from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.diagnosed_runs import diagnose_runs
 from terrain.discrepancy.grounds import simulation_for
 from terrain.discrepancy.health.readings import candidate_changes
@@ -111,7 +110,7 @@ def dynamic_runs(effects=None, robot=AGRIMARO, terrain="grass", n=6, **options):
 )
 def test_an_effect_hidden_in_the_plant_is_named_and_nothing_else(effects, options):
     runs = dynamic_runs(effects, **options)
-    diagnosis = diagnose(runs, simulation_for(runs, AGRIMARO, LIBRARY)[0], LIBRARY)
+    diagnosis = diagnose_runs(runs, AGRIMARO, LIBRARY, 0, 0).diagnosis
     assert diagnosis.values == {name: pytest.approx(value, rel=0.15) for name, value in effects.items()}
     assert (diagnosis.ambiguous_sets, diagnosis.excluded_runs, diagnosis.faults) == ((), (), ())
     if not effects:
@@ -124,8 +123,9 @@ def relabelled(runs, label):
 
 def test_runs_are_simulated_on_the_soil_of_their_label_where_they_need_it():
     runs = dynamic_runs(n=9, duration_s=20.0)
-    simulation, matches = simulation_for(runs, AGRIMARO, LIBRARY)
-    assert [match[:2] for match in matches] == [("grass", "grass")]
+    found = diagnose_runs(runs, AGRIMARO, LIBRARY, 0, 0)
+    simulation = found.simulation
+    assert [match[:2] for match in found.terrains] == [("grass", "grass")]
     soil = planar_ground(AGRIMARO, load_soil("grass"))
     assert simulation.grounds["grass"]._replace(effective_ratio=1.0) == soil
     assert simulation.model_error
@@ -198,9 +198,9 @@ def test_a_label_that_helps_no_run_changes_nothing():
     several = replace(runs[0], labels=(Label(0.0, 5.0, "grass"), Label(5.0, 9.0, "snow")))
     for label in ("snow", "moon"):
         given = [*relabelled(runs, label), replace(several, run_id="s")]
-        simulation, matches = simulation_for(given, HUSKY, library_of("skid_steer"))
-        assert [match[:2] for match in matches] == [("", None), (label, None)]
-        assert (simulation.grounds, simulation.model_error) == ({}, {})
+        found = diagnose_runs(given, HUSKY, library_of("skid_steer"), 0, 0)
+        assert [match[:2] for match in found.terrains] == [("", None), (label, None)]
+        assert (found.simulation.grounds, found.simulation.model_error) == ({}, {})
 
 
 @pytest.mark.parametrize(("robot", "effective"), [(AGRIMARO, 0.0), (HUSKY, 1.0)])
