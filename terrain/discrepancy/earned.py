@@ -243,7 +243,9 @@ def judge(fit: CauseFit, built: Sequence[Effect], on: HeldOut) -> Judgement:
 
     Where the squares gain more than :data:`WORSE`, but not with their interval, that part is by how much likelier the
     runs are (:func:`likelier_with`): noise of all else, and what varies from run to run, hide a small change.  Two
-    causes that make up for each other gain more than all there is.
+    causes that make up for each other gain more than all there is.  Where they gain less, but the learner finds nothing
+    there beyond the extension, so that noise is left, it is the same, and half of the change has to show with its
+    interval.
 
     Where runs are so few that their thirds are the clusters, causes are judged together by that: where the interval of
     all of them is above 0, one is dropped only if the runs do not show it by themselves, the interval of the part of
@@ -270,12 +272,15 @@ def judge(fit: CauseFit, built: Sequence[Effect], on: HeldOut) -> Judgement:
         changed = part.changes >= np.maximum(SHARE * whole, 1e-30)
         acting[cause.name] = tuple(n for n in order if n in gain.channels and changed[CHANNELS.index(n)])
         ratio, interval = part.gain(weights * acts, on.seed)
-        confirmed = interval[0] > 0.0
-        own_gain, learner, left = gains_of(squares @ (weights * acts), True, on.seed)
-        if together or (not confirmed and (left[0] <= 0.0 or WORSE < ratio <= 1.0)):
+        own_gain, learner, _ = gains_of(squares @ (weights * acts), True, on.seed)
+        confirmed, seen = interval[0] > 0.0, WORSE < ratio <= 1.0
+        known = [gain.channels[name] for name in main if name in gain.channels]
+        noise_is_left = all(of.learner_reduction <= of.reduction for of in known)
+        if together or (not confirmed and (seen or noise_is_left)):
             (likelier, ends), size = likelier_with(info, of_parts, rest, on, runs), part.size(weights * acts)
             ratio, interval = min(size * likelier, 1.0), (size * ends[0], min(size * ends[1], 1.0))
-            confirmed = likelier > 0.0 and ends[0] > -1.0 if together else ends[0] > 0.0
+            least = 0.0 if seen else HALF
+            confirmed = likelier > 0.0 and ends[0] > -1.0 if together else ends[0] > least
         removed[cause.name] = ratio, interval
         words = " and ".join([CHANNEL_WORDS[name][0] for name in main])
         net = float(((part.squares[:, 1] - part.squares[:, 2]).sum(axis=0) * weights).sum())

@@ -84,7 +84,7 @@ def on_soils(
     library: Sequence[Effect],
     signals: Sequence[Signals] | None = None,
 ) -> tuple[Simulation, tuple[TerrainMatch, ...]]:
-    """Return a simulation of runs on the soils of those labels that are no further from the runs than its own ground.
+    """Return a simulation of runs on the soils of those labels that come near to the runs, see :data:`NEAR`.
 
     That is without anything fitted: what many parameters together make of a ground says little about it.
     """
@@ -97,8 +97,9 @@ def on_soils(
         some, low_pass = few_of(own), low_pass_of(own)
         plain = evidence_at(some, given, given.vector, (), low_pass)
         tried = replace(given, grounds={label: soil})
-        about = {"noise": plain.noise, "scatter": plain.scatter}
-        beside = evidence_at(some, tried, given.vector, (), low_pass, **about)
+        beside = evidence_at(
+            some, tried, given.vector, (), low_pass, noise=plain.noise, scatter=plain.scatter
+        )
         if log_ratio(beside.c, plain.c).mean() > -math.log(NEAR):
             grounds[label] = soil
             soils.append(label)
