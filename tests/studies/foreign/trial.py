@@ -23,6 +23,7 @@ from pipelines.explain.explain import explain
 from studies.foreign.worlds import WORLDS, World, driven_by, effect_of, effects_of, runs_of
 from terrain.discrepancy.diagnose import POWER_Z
 from terrain.discrepancy.evidence import Z_EFFECT, Evidence, evidence_at, marginal
+from terrain.discrepancy.health.fault import Column, FaultKind
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.runs import Simulation, low_pass_of, signals_of
 from terrain.discrepancy.search import names_of
@@ -176,6 +177,8 @@ def asked(runs: Sequence[RunLog], robot: Robot) -> tuple[Answer, Robot]:
     except DataError as error:
         return Answer(refusal=str(error)), robot
     diagnosis: Any = found.diagnosis
+    # a scale beyond that of any sensor is stated as a fault of the logs
+    scales = [fault for fault in diagnosis.faults if fault.change[:2] == (FaultKind.SCALE, Column.GYRO)]
     terms = found.extended.learned[len(robot.learned) :]
     return Answer(
         named={
@@ -184,11 +187,12 @@ def asked(runs: Sequence[RunLog], robot: Robot) -> tuple[Answer, Robot]:
                 for e in diagnosis.varying
             },
             **{v.name: (v.value, v.low, v.high) for cause in diagnosis.built_in for v in cause.parameters},
+            **{"gyro_scale_ratio": (1.0 / fault.change.factor - 1.0,) * 3 for fault in scales},
         },
-        causes=tuple(cause.name for cause in diagnosis.causes),
+        causes=(*(cause.name for cause in diagnosis.causes), *("gyro_scale" for _ in scales[:1])),
         sets=diagnosis.ambiguous_sets,
         varying=tuple(each.name for each in diagnosis.varying),
-        faults=tuple(fault.sentence for fault in diagnosis.faults),
+        faults=tuple(fault.sentence for fault in diagnosis.faults if fault not in scales),
         candidates=tuple(cause.name for cause in diagnosis.candidates),
         unexplained=(
             *(f"{each.channel} by {each.input}" for each in diagnosis.unexplained),
