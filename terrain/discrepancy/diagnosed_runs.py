@@ -182,10 +182,12 @@ def found_on_ground(
     if not any(match.soil for match in on_labels):
         return found, simulation, terrains
     few = few_of(range(len(runs)))
-    some = [runs[i] for i in few], [signals[i] for i in few]
-    every = len(few) == len(runs)
-    one = found if every else find_causes(some[0], simulation, library, some[1])
-    other = find_causes(some[0], on_soil, library, some[1])
+    some, every = ([runs[i] for i in few], [signals[i] for i in few]), len(few) == len(runs)
+    try:
+        one = found if every else find_causes(some[0], simulation, library, some[1])
+        other = find_causes(some[0], on_soil, library, some[1])
+    except DataError:  # on the soil too few of them are fit to be compared
+        return found, simulation, terrains
     noise = np.array([one.noise.get(name, np.inf) for name in CHANNELS])
 
     def left_by(each: Found) -> dict[str, float]:

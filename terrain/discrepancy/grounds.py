@@ -70,49 +70,39 @@ def simulation_for(
     The ``signals`` of the runs are taken where they are known already.
     """
     simulation = Simulation(robot, Ground(), robot.effects, spread_numbers("scatter"), learned=robot.learned)
-    grounds = {
-        label: tilted(own, simulation, library, simulation.ground)
-        for label, own in by_label(runs, robot, signals).items()
-        if own
-    }
-    return on_grounds(simulation, by_label(runs, robot, signals), grounds, ())
+    labels = by_label(runs, [signals_of(run, robot) for run in runs] if signals is None else signals)
+    grounds = {name: tilted(own, simulation, library, Ground()) for name, own in labels.items() if own}
+    return on_grounds(simulation, labels, grounds, ())
 
 
 def on_soils(
-    runs: Sequence[RunLog],
-    given: Simulation,
-    library: Sequence[Effect],
-    signals: Sequence[Signals] | None = None,
+    runs: Sequence[RunLog], given: Simulation, library: Sequence[Effect], signals: Sequence[Signals]
 ) -> tuple[Simulation, tuple[TerrainMatch, ...]]:
     """Return a simulation of runs on the soils of those labels that come near to the runs, see :data:`NEAR`.
 
     That is without anything fitted: what many parameters together make of a ground says little about it.
     """
-    robot, labels = given.robot, by_label(runs, given.robot, signals)
-    known, grounds, soils = {*soil_names(), *packaged(EXTRA)}, dict(given.grounds), []
+    labels, known = by_label(runs, signals), {*soil_names(), *packaged(EXTRA)}
+    grounds, soils = dict(given.grounds), []
     for label, own in labels.items():
-        if not (own and label in known and drivable(robot, label)):
-            continue
-        soil = tilted(own, given, library, planar_ground(robot, load_soil(label)))
-        some, low_pass = few_of(own), low_pass_of(own)
-        plain = evidence_at(some, given, given.vector, (), low_pass)
-        tried = replace(given, grounds={label: soil})
-        beside = evidence_at(
-            some, tried, given.vector, (), low_pass, noise=plain.noise, scatter=plain.scatter
-        )
-        if log_ratio(beside.c, plain.c).mean() > -math.log(NEAR):
-            grounds[label] = soil
-            soils.append(label)
+        if own and label in known and drivable(given.robot, label):
+            soil = tilted(own, given, library, planar_ground(given.robot, load_soil(label)))
+            some, low_pass, point = few_of(own), low_pass_of(own), given.vector
+            plain, tried = (
+                evidence_at(some, given, point, (), low_pass),
+                replace(given, grounds={label: soil}),
+            )
+            beside = evidence_at(some, tried, point, (), low_pass, noise=plain.noise, scatter=plain.scatter)
+            if log_ratio(beside.c, plain.c).mean() > -math.log(NEAR):
+                grounds[label] = soil
+                soils.append(label)
     return on_grounds(given, labels, grounds, soils)
 
 
-def by_label(
-    runs: Sequence[RunLog], robot: Robot, signals: Sequence[Signals] | None
-) -> dict[str, list[Signals]]:
+def by_label(runs: Sequence[RunLog], signals: Sequence[Signals]) -> dict[str, list[Signals]]:
     """Return the signals of runs by their label, empty where they have several."""
-    every = [signals_of(run, robot) for run in runs] if signals is None else signals
     labels = sorted({run.terrains[0] if len(run.terrains) == 1 else "" for run in runs})
-    return {label: [run for run in every if run.terrain == label] for label in labels}
+    return {label: [run for run in signals if run.terrain == label] for label in labels}
 
 
 def on_grounds(
@@ -128,9 +118,8 @@ def on_grounds(
             errors[kind] = {n: size for n, size in spread_numbers(kind).items() if n in parameters}
         simulation = replace(simulation, **errors)
     ratios = {label: ground.effective_ratio for label, ground in grounds.items()}
-    return replace(simulation, grounds=grounds), tuple(
-        TerrainMatch(label, label if label in soils else None, ratios.get(label)) for label in labels
-    )
+    matches = [TerrainMatch(label, label if label in soils else None, ratios.get(label)) for label in labels]
+    return replace(simulation, grounds=grounds), tuple(matches)
 
 
 def few_of(runs: Sequence[T]) -> list[T]:

@@ -178,7 +178,8 @@ def asked(runs: Sequence[RunLog], robot: Robot) -> tuple[Answer, Robot]:
         return Answer(refusal=str(error)), robot
     diagnosis: Any = found.diagnosis
     # a scale beyond that of any sensor is stated as a fault of the logs
-    scales = [fault for fault in diagnosis.faults if fault.change[:2] == (FaultKind.SCALE, Column.GYRO)]
+    scales = [each for each in diagnosis.faults if each.change[:2] == (FaultKind.SCALE, Column.GYRO)]
+    scale = {"gyro_scale_ratio": (1.0 / scales[0].change.factor - 1.0,) * 3} if scales else {}
     terms = found.extended.learned[len(robot.learned) :]
     return Answer(
         named={
@@ -187,9 +188,9 @@ def asked(runs: Sequence[RunLog], robot: Robot) -> tuple[Answer, Robot]:
                 for e in diagnosis.varying
             },
             **{v.name: (v.value, v.low, v.high) for cause in diagnosis.built_in for v in cause.parameters},
-            **{"gyro_scale_ratio": (1.0 / fault.change.factor - 1.0,) * 3 for fault in scales},
+            **scale,
         },
-        causes=(*(cause.name for cause in diagnosis.causes), *("gyro_scale" for _ in scales[:1])),
+        causes=(*(cause.name for cause in diagnosis.causes), *["gyro_scale"] * len(scale)),
         sets=diagnosis.ambiguous_sets,
         varying=tuple(each.name for each in diagnosis.varying),
         faults=tuple(fault.sentence for fault in diagnosis.faults if fault not in scales),
