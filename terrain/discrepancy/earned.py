@@ -276,7 +276,7 @@ def judge(fit: CauseFit, built: Sequence[Effect], on: HeldOut) -> Judgement:
         confirmed, seen = interval[0] > 0.0, WORSE < ratio <= 1.0
         known = [gain.channels[name] for name in main if name in gain.channels]
         noise_is_left = all(of.learner_reduction <= of.reduction for of in known)
-        if together or (not confirmed and (seen or noise_is_left)):
+        if together or (not confirmed and ratio <= 1.0 and (seen or noise_is_left)):
             (likelier, ends), size = likelier_with(info, of_parts, rest, on, runs), part.size(weights * acts)
             ratio, interval = min(size * likelier, 1.0), (size * ends[0], min(size * ends[1], 1.0))
             least = 0.0 if seen else HALF
