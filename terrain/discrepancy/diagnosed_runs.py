@@ -194,13 +194,14 @@ def found_on_ground(
         compared = compare_runs(each.extended, None, each.problem.signals, each.problem.low_pass)
         return {run.run_id: float(np.nansum((run.residual(False) / noise) ** 2)) for run in compared}
 
-    without, left = left_by(one), left_by(other)
+    left, without = left_by(other), left_by(one)
     both = [run for run in one.problem.signals if run.run_id in left]
     loss, loss_without = (np.array([of[run.run_id] for run in both]) for of in (left, without))
     fewer = len(other.fit.causes) < len(one.fit.causes) and loss.sum() < loss_without.sum()
-    if not (fewer or is_better(loss, loss_without, units_of(both))):
-        return found, simulation, terrains
-    return other if every else find_causes(runs, on_soil, library, signals), on_soil, on_labels
+    if fewer or is_better(loss, loss_without, units_of(both)):
+        with suppress(DataError):  # so may all of them be
+            return other if every else find_causes(runs, on_soil, library, signals), on_soil, on_labels
+    return found, simulation, terrains
 
 
 def held_out_gain(diagnosed: DiagnosedRuns, robot: Robot, seed: int) -> HeldOutGain:

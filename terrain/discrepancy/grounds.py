@@ -83,7 +83,7 @@ def on_soils(
     That is without anything fitted: what many parameters together make of a ground says little about it.
     """
     labels, known = by_label(runs, signals), {*soil_names(), *packaged(EXTRA)}
-    grounds, soils = dict(given.grounds), []
+    soils: dict[str, Ground] = {}
     for label, own in labels.items():
         if own and label in known and drivable(given.robot, label):
             soil = tilted(own, given, library, planar_ground(given.robot, load_soil(label)))
@@ -94,9 +94,8 @@ def on_soils(
             )
             beside = evidence_at(some, tried, point, (), low_pass, noise=plain.noise, scatter=plain.scatter)
             if log_ratio(beside.c, plain.c).mean() > -math.log(NEAR):
-                grounds[label] = soil
-                soils.append(label)
-    return on_grounds(given, labels, grounds, soils)
+                soils[label] = soil
+    return on_grounds(given, labels, {**given.grounds, **soils}, soils)
 
 
 def by_label(runs: Sequence[RunLog], signals: Sequence[Signals]) -> dict[str, list[Signals]]:
@@ -149,8 +148,8 @@ def tilted(
     about = {"noise": measure.noise, "scatter": measure.scatter}  # of all alike
     losses = np.array([held_out_losses(on(ratio), simulation.effects) for ratio in RATIOS])
     least = losses[int(np.argmin(losses.sum(axis=1)))]
-    default = ground == simulation.ground
-    if default and not is_better(least, losses[-1], [run.session or run.run_id for run in runs]):
+    units = [run.session or run.run_id for run in runs]
+    if ground == simulation.ground and not is_better(least, losses[-1], units):
         return ground
     return ground._replace(effective_ratio=best_ratio(losses.sum(axis=1)))
 

@@ -422,6 +422,13 @@ def test_a_fault_changes_its_channels_and_no_others_by_what_its_name_states(robo
 # -- One blind trial: what it depends on, and what it counts when the diagnosis refuses the runs -----------
 
 
+@pytest.mark.slow
+def test_a_cause_that_squares_do_not_show_earns_its_name_where_noise_is_left():
+    """A dead zone of 2 mm/s, 3 % of the square of a yaw rate, beside wheels that slip."""
+    trial = run_trial(cases_of(Row.TWO, 12, 90420, 8)[11])
+    assert (trial.right, set(trial.named)) == (True, {"wheel_dead_zone", "ground_slip"})
+
+
 def test_refused_runs_count_as_a_false_alarm(monkeypatch):
     def refuse(*_):
         raise DataError("runs: only 2 of 8 are fit to be compared")
