@@ -51,6 +51,7 @@ from terrain.files.documents import check_keys, is_number, numbers, read_yaml
 from terrain.files.names import check_name, described_file, packaged, shown
 from terrain.learned_term import LearnedTerm, read_learned
 from terrain.records import Array, read_only
+from terrain.robot_sizes import refuse_odd_sizes
 
 #: Part of a range's width that a run may go beyond it: its ends are percentiles, which runs of the same kind
 #: miss by that much.
@@ -497,6 +498,7 @@ class Robot(ABC):
         """Refuse dimensions that no body can have; ``place`` is what messages call the robot."""
         if self.wheelbase_m <= 0 or self.track_m <= 0:
             raise ConfigError(f"{place}: track_m and wheelbase_m must be above zero")
+        refuse_odd_sizes(place, self)
         if not self.describes("body"):
             return
         body = self.body
@@ -660,6 +662,7 @@ class OmniRobot(Robot):
         """Refuse dimensions that no body can have, and a load that lifts a wheel."""
         if self.wheel_distance_m <= 0:
             raise ConfigError(f"{place}: wheel_distance_m must be above zero")
+        refuse_odd_sizes(place, self)
         if not self.describes("body"):
             return
         if 2.0 * self.wheel_distance_m > self.body.footprint_max_m:
@@ -782,7 +785,7 @@ class BicycleRobot(Robot):
             )
         if not 0.0 < self.steering_max_rad < np.pi / 2:
             raise ConfigError(
-                f"{place}: steering_max_rad is {self.steering_max_rad:g}, below pi/2 is required"
+                f"{place}: steering_max_rad is {self.steering_max_rad:g}, below pi/2 is required (degrees?)"
             )
 
 

@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MAX_LINES = {"terrain": 53_300, "features": 2_750, "pipelines": 19_400, "tests": 48_470}
+MAX_LINES = {"terrain": 53_600, "features": 2_750, "pipelines": 19_400, "tests": 48_550}
 """Lines of Python, docstrings included."""
 
 

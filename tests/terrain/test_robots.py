@@ -78,7 +78,7 @@ def test_a_section_that_is_not_described_is_named_and_a_completed_robot_has_a_ne
         (ROBOTINO, {"track_m": -0.1}, "wheel_distance_m must be above zero"),
         (ROBOTINO, {"body": {"com_x_m": 0.2}}, "outside the triangle of the wheels: wheel 2 would carry"),
         (AGRIMARO, {"body": {"com_x_m": 0.6}}, "outside the triangle of the wheels: wheel 1 would carry"),
-        (AGRIMARO, {"track_m": 5.0}, "track_m is 5; the footprint allows"),
+        (AGRIMARO, {"track_m": 1.5}, "track_m is 1.5; the footprint allows"),
         (UGV, {"track_width_m": 2.0}, "the tracks would overlap"),
         (CAR, {"com_ahead_m": 2.0}, "between 0 and wheelbase_m"),
         (CAR, {"steering_max_rad": 2.0}, "below pi/2 is required"),
@@ -89,6 +89,75 @@ def test_impossible_dimensions_are_refused(robot, change, message):
         robot, change = robot.with_parts(body=replace(robot.body, **change["body"])), {}
     with pytest.raises(ConfigError, match=message):
         replace(robot, **change).check_geometry("robot")
+
+
+BAD_SIZES = [
+    (HUSKY, "wheel_radius_m", 22.0, "0.004 to 2.5 m is expected: in cm?"),
+    (HUSKY, "wheel_radius_m", 6.5, "0.004 to 2.5 m is expected: in cm?"),  # inches
+    (HUSKY, "wheel_radius_m", 0.00165, "is expected"),
+    (HUSKY, "track_m", 570.8, "0.02 to 25 m is expected: in mm?"),
+    (HUSKY, "track_m", 5.708, "beside track_m 5.71, wheelbase_m 0.512, wheel_radius_m 0.165"),
+    (HUSKY, "wheelbase_m", 0.0512, "wheelbase_m is 0.0512, 0.0951 to 3.42 m is expected"),
+    (HUSKY, "mass_kg", 50_000.0, "in g?"),
+    (HUSKY, "mass_kg", 0.05, "in t?"),
+    (HUSKY, "body.yaw_inertia_kgm2", 37_000.0, "of 50 kg and track_m 0.571"),
+    (HUSKY, "body.com_height_m", 190.0, "in mm?"),
+    (HUSKY, "body.contact_length_m", 100.0, "in mm?"),
+    (HUSKY, "body.tyre_stiffness_npm", 40.0, "in N/mm?"),
+    (HUSKY, "motors.efficiency_ratio", 70.0, "in %?"),
+    (HUSKY, "motors.speed_max_radps", 6.1 * 60 / (2 * math.pi), "motors.supply_v is 24, 67.2 to"),  # rpm
+    (HUSKY, "motors.reduction_ratio", 1 / 78.71, "motors.supply_v is 24"),
+    (HUSKY, "motors.torque_max_nm", 60_000.0, "in mNm?"),
+    (HUSKY, "motors.torque_time_constant_s", 5.0, "in ms?"),
+    (HUSKY, "camera.lever_x_m", 350.0, "a robot of 0.571 m): in mm?"),
+    (HUSKY, "camera.latency_s", 20.0, "in ms?"),
+    (HUSKY, "sensors.gyro_bias_z_radps", 3.0, "in deg/s?"),
+    (HUSKY, "identified.effective_track_m", 5.0, "track_m is 0.571 m"),
+    (HUSKY, "identified.rolling_radius_m", 0.33, "wheel_radius_m is 0.165 m"),
+    (AGRIMARO, "steering.rate_max_radps", 120.0, "in deg/s?"),
+    (AGRIMARO, "steering.zero_1_rad", 90.0, "in deg?"),
+    (ROBOTINO, "wheel_radius_m", 4.0, "is expected"),
+    (ROBOTINO, "first_wheel_rad", 60.0, "in deg?"),
+    (UGV, "wheel_radius_m", 15.0, "sprocket_radius_m is 15"),
+    (UGV, "wheelbase_m", 120.0, "contact_length_m is 120"),
+    (CAR, "steering_max_rad", 20.0, "degrees?"),
+    (CAR, "speed_max_mps", 300.0, "0.01 to 120 m/s is expected: in"),
+    (CAR, "front_cornering_npr", 260.0, "in N/deg?"),
+    (CAR, "yaw_inertia_kgm2", 2.0, "of 420 kg and track_m"),
+]
+
+
+@pytest.mark.parametrize(("robot", "name", "value", "message"), BAD_SIZES)
+def test_a_size_that_cannot_belong_to_the_others_is_refused_with_its_likely_unit(robot, name, value, message):
+    """One number in another unit, or by a factor of ten: the sentence names it, and what is expected."""
+    section, _, key = name.rpartition(".")
+    if section == "identified":
+        robot = replace(robot, identified={key: value})
+    elif section:
+        robot = robot.with_parts(**{section: replace(robot.parts[section], **{key: value})})
+    else:
+        robot = replace(robot, **{key: value})
+    with pytest.raises(ConfigError, match=r"^mine\.yaml: ") as error:
+        robot.check_geometry("mine.yaml")
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("factor", [0.2, 1.0, 8.0])
+@pytest.mark.parametrize("robot", [HUSKY, AGRIMARO, ROBOTINO, UGV, CAR])
+def test_sizes_belong_together_at_any_scale(robot, factor):
+    """Geometrically similar robots of equal density: lengths by k, masses by k^3."""
+    scaled = {name: getattr(robot, name) * factor for name in ("wheel_radius_m", "track_m", "wheelbase_m")}
+    scaled |= {"mass_kg": robot.mass_kg * factor**3, "parts": {}}
+    if robot is CAR:
+        scaled |= {"com_ahead_m": robot.com_ahead_m * factor, "com_height_m": robot.com_height_m * factor}
+        scaled |= {
+            name: getattr(robot, name) * factor**3 for name in ("front_cornering_npr", "rear_cornering_npr")
+        }
+        scaled["yaw_inertia_kgm2"] = robot.yaw_inertia_kgm2 * factor**5
+    if robot is UGV:
+        scaled |= {"com_height_m": robot.com_height_m * factor, "track_width_m": robot.track_width_m * factor}
+    replace(robot, **scaled).check_geometry("robot")
 
 
 @pytest.mark.parametrize(
