@@ -20,6 +20,10 @@ class NotTakenWarning(UserWarning):
     """Filters do not take part of what was learned of a robot, which its simulation does."""
 
 
+class DoubtfulRunWarning(UserWarning):
+    """A run that was read may not be what it states: its units, signs, axes, or the robot that is named."""
+
+
 class LogError(TerrainError):
     """A run log cannot be read as it stands: the message names file, row and value."""
 

@@ -85,7 +85,7 @@ ALONE: dict[str, tuple[float, float]] = {
     "position_std_m": (0.0, 20.0),
     "rate_hz": (0.0, 1e5),
 }
-#: Identified values over the nominal ones: tyres give way by a tenth; skidding makes the effective track 1 to 4 times
+#: Identified values over the nominal ones: tyres deform by a tenth; skidding makes the effective track 1 to 4 times
 #: the distance of the sides, and what identifies it has an interval.
 IDENTIFIED_OVER_NOMINAL = {
     "rolling_radius_m": ("wheel_radius_m", 0.5, 1.5),

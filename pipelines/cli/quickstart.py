@@ -78,7 +78,8 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
     Runs go to ``out/runs``, the page to ``out/report.html``.  Where there are enough, some runs are held out, and
     these are predicted.
     """
-    from pipelines.data.datasets import load_runs
+    from pipelines.data.datasets import load
+    from pipelines.data.settings import RunsSettings
     from pipelines.data.tracking import ensure_tracking
     from pipelines.learn.model_file import read_model
     from pipelines.learn.predict import predict
@@ -94,7 +95,7 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
     ensure_tracking()
     with _compiling_ahead():
         given: Sequence[RunLog]
-        slip, figures = None, tuple[Figure, ...]()
+        slip, figures, doubts = None, tuple[Figure, ...](), list[str]()
         if data is None:
             # kernels are compiled when they are imported: meanwhile, not before
             from pipelines.slip.filtered import motion_figure, slip_figure
@@ -103,7 +104,7 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
             given, slip, example = labelled_runs(settings.seed, settings.runs_a_terrain, progress)
             figures = slip_figure(example), motion_figure(example)
         else:
-            given = load_runs(data)
+            given, _, doubts = load(RunsSettings(data=data))
         runs, _ = distinct_runs(given, merge=settings.merge_duplicates)
         dataset = SIMULATED if data is None else data.resolve().name
         training, held_out = hold_out_runs(runs)
@@ -125,7 +126,7 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
         report_file=out / REPORT_FILE,
         held_out=tuple(each.run_id for each in held_out),
         figures=figures,
-    )
+    ).with_doubts(doubts)
     result.report.save(result.report_file)
     return result
 
@@ -165,13 +166,14 @@ def _commands(settings: Settings, model_uri: str, held_out: Sequence[RunLog]) ->
 
 def _keep(runs: Sequence[RunLog], data: Path | None, folder: Path, progress: Progress) -> dict[str, Any]:
     """Write run folders into ``folder``; earlier ones of the same data are used as they are, others refused."""
-    from pipelines.data.datasets import load_runs
+    from pipelines.data.datasets import load
+    from pipelines.data.settings import RunsSettings
     from terrain.files.atomic import atomic_folder
     from terrain.logs.run_folders import data_digest, write_run
 
     kept = {"out": folder, "n_runs": len(runs), "reused": folder.exists()}
     if kept["reused"]:
-        if data_digest(load_runs(folder)) != data_digest(runs):
+        if data_digest(load(RunsSettings(data=folder))[0]) != data_digest(runs):
             raise DataError(
                 f"{folder}: holds other runs than {data or 'this simulation'}; choose another --out"
             )

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.data.datasets import load, verdict
+from pipelines.data.datasets import read
 from pipelines.data.settings import MAPPING_TEXT, RunsSettings, Target
 from pipelines.report.numbers import format_counts, plural
 from pipelines.report.results import Progress, Result, described, silent
@@ -44,6 +44,7 @@ class ConvertResult(Result):
     dropped: Mapping[str, int] = described("what a repairing reader dropped, as counts by kind")
     skipped: tuple[str, ...] = described("a sentence for each run that could not be read")
     digest: str = described("SHA-256 of all runs; messages that are converted back have the same")
+    doubts: tuple[Doubt, ...] = described("checks that are doubtful or implausible")
 
 
 class ImportResult(ConvertResult):
@@ -52,7 +53,6 @@ class ImportResult(ConvertResult):
     run_ids: tuple[str, ...] = described("ids of the runs, sorted")
     labels: Mapping[str, int] = described("runs by terrain")
     duplicates: tuple[SharedStretch, ...] = described("stretches that two of the runs share", default=())
-    doubts: tuple[Doubt, ...] = described("checks that are doubtful or implausible", default=())
 
 
 class ExportResult(ConvertResult):
@@ -66,31 +66,19 @@ def run(settings: Settings, progress: Progress = silent) -> ImportResult | Expor
     """Read every run under a folder, then write each under ``settings.out``.
 
     All runs are read and checked, and all places found free, before the first one is written; nothing that
-    is already in the folder is touched.  Windows that were recorded with a run go with it.  An implausible
-    run becomes no run folder; with ``repair`` it is written as it is, and counts which checks it does not
-    pass.
+    is already in the folder is touched.  Windows that were recorded with a run go with it.
     """
     from pipelines.data.run_writers import target_place, write
     from terrain.files.atomic import atomic_write
     from terrain.logs.duplicates import shared_stretches
     from terrain.logs.mapping import csv_mapping
-    from terrain.logs.plausibility import counted, doubts_of, refuse_implausible_runs
     from terrain.logs.run_folders import data_digest
-    from terrain.robots import load_robot
 
-    runs, skipped = load(settings)
+    runs, skipped, doubts, _ = read(settings)
     places = {run.run_id: target_place(run.run_id, settings.out, settings.to) for run in runs}
     for place in places.values():
         if place.exists():
             raise LogError(f"{place}: is there already, and is left as it is; write into another folder")
-    doubts: tuple[Doubt, ...] = ()
-    if settings.to == "runs":
-        given = None if settings.robot is None else load_robot(settings.robot)
-        verdicts = {run.run_id: verdict(run, given) for run in runs}
-        doubts = doubts_of(verdicts)
-        if not settings.repair:
-            refuse_implausible_runs(doubts)
-        runs = [counted(run, verdicts[run.run_id]) for run in runs]
     windows = _recorded_windows(settings.data)
     counts: Counter[str] = Counter()
     written: list[Path] = []
@@ -107,7 +95,7 @@ def run(settings: Settings, progress: Progress = silent) -> ImportResult | Expor
             shutil.rmtree(place, ignore_errors=True) if place.is_dir() else place.unlink(missing_ok=True)
         raise
     dropped = sum((Counter(each.dropped) for each in runs), Counter[str]())
-    found = settings.out, len(runs), dict(sorted(dropped.items())), tuple(skipped), data_digest(runs)
+    found = settings.out, len(runs), dict(sorted(dropped.items())), tuple(skipped), data_digest(runs), doubts
     if settings.to != "runs":
         files = {run_id: place.name for run_id, place in places.items()}
         return ExportResult(*found, files, dict(sorted(counts.items())))
@@ -117,7 +105,6 @@ def run(settings: Settings, progress: Progress = silent) -> ImportResult | Expor
         tuple(each.run_id for each in runs),
         dict(sorted(labels.items())),
         shared_stretches(runs),
-        doubts,
     )
 
 
@@ -143,14 +130,14 @@ def report(result: ImportResult | ExportResult) -> Report:
 
     runs = plural(result.n_runs, "run")
     counts = f", {format_counts(result.dropped)}" if result.dropped else ""
-    warnings = [f"skipped: {sentence}" for sentence in result.skipped]
+    warnings = [*result.skipped, *doubt_sentences(result.doubts)]
     if isinstance(result, ExportResult):
         runs += f", {sum(result.topics.values())} messages on {plural(len(result.topics), 'topic')},"
         table = Table(("topic", "messages"), tuple(result.topics.items()))
         parts, details = [], sections(("Messages", [table]))
         next_step = f"terrain convert {result.out} --out runs/"
     else:
-        warnings += [*doubt_sentences(result.doubts), *sentences(result.duplicates)]
+        warnings += sentences(result.duplicates)
         parts = [Table(("terrain", "runs"), tuple(result.labels.items()))] if result.labels else []
         details, next_step = (), f"terrain inspect {result.out}"
     return Report(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import chain
 from operator import attrgetter
@@ -13,12 +14,21 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipelines.data.settings import AlignedRunsSettings, RunsSettings, chosen_runs
-from terrain.errors import ConfigError, LogError
+from terrain.errors import ConfigError, DoubtfulRunWarning, LogError
+from terrain.logs.plausibility import (
+    Check,
+    Doubt,
+    Scale,
+    counted,
+    doubt_sentences,
+    doubts_of,
+    judge,
+    refuse_implausible_runs,
+)
 
 if TYPE_CHECKING:
     from pipelines.data.runs import Runs
     from terrain.logs.drive import DriveRobot
-    from terrain.logs.plausibility import Check
     from terrain.records import RunLog
     from terrain.robots import Robot
 
@@ -57,7 +67,7 @@ _log = logging.getLogger(__name__)
 
 
 class RunLoader(NamedTuple):
-    """Reads one run of a data set as :func:`load` gives it; it can be sent to another process."""
+    """Reads one run of a data set as :func:`read` gives it; it can be sent to another process."""
 
     read: Callable[..., RunLog]  #: reader of the layout
     #: repair, align: as :func:`load_runs`
@@ -97,6 +107,9 @@ class RunLoader(NamedTuple):
 def load_runs(folder: str | Path, *, robot: str | Path | None = None, **reading: Any) -> Runs:
     """Return the runs that lie under a folder, sorted by their id; a warning is logged for each that is skipped.
 
+    Every run passes the gate that those of all commands pass (:mod:`terrain.logs.plausibility`): one whose units, signs
+    or axes cannot be right is refused, what is doubtful is a :class:`~terrain.errors.DoubtfulRunWarning`.
+
     Parameters
     ----------
     folder : a run folder, a folder of run folders, a folder in the BorealTC or the DRIVE layout (a session,
@@ -107,31 +120,54 @@ def load_runs(folder: str | Path, *, robot: str | Path | None = None, **reading:
     layout : one of :data:`~pipelines.data.settings.Layout`; ``auto`` looks, as by default
     mapping : YAML file that describes how to read CSV files (``terrain.logs.mapping``); of logs of a CAN bus
         their DBC, by default AgriMaRo's; of bags their topics (``terrain.logs.mapping``)
-    repair : drop and count what a strict read refuses, and skip runs that cannot be read at all
+    repair : drop and count what a strict read refuses, take implausible runs as they are and count what is
+        implausible, and skip runs that cannot be read at all
     align : bring the wheel stream onto the clock of the IMU where the two clocks can be compared
 
     Raises
     ------
     LogError, ConfigError, DataError
-        as :func:`load`.
+        as :func:`read`.
     """
     from pipelines.data.runs import Runs
 
     name = None if robot is None else str(robot)
-    runs, skipped = load(AlignedRunsSettings(data=Path(folder), robot=name, **reading))
-    for sentence in skipped:
+    found = read(AlignedRunsSettings(data=Path(folder), robot=name, **reading))
+    for sentence in found.skipped:
         _log.warning(sentence)
-    return Runs(runs)
+    for sentence in doubt_sentences(found.doubts):
+        warnings.warn(sentence, DoubtfulRunWarning, stacklevel=2)
+    return Runs(found.runs)
 
 
-def load(settings: RunsSettings) -> tuple[list[RunLog], list[str]]:
-    """Return the runs of the settings, sorted by their id, and a sentence for each that a repairing read skipped.
+class ReadRuns(NamedTuple):
+    """Runs of a data set that passed the gate."""
+
+    runs: list[RunLog]  #: sorted by their id
+    skipped: list[str]  #: a sentence for each that a repairing read skipped
+    doubts: tuple[Doubt, ...]  #: what is doubtful or implausible about the others
+    verdicts: Mapping[str, tuple[Check, ...]]  #: every check of each run, by its id
+
+
+def load(settings: RunsSettings, *, refuse: bool = True) -> tuple[list[RunLog], list[str], list[str]]:
+    """Return the runs of :func:`read`, and sentences: on runs that were skipped, and on what is doubtful."""
+    found = read(settings, refuse=refuse)
+    return found.runs, found.skipped, [*doubt_sentences(found.doubts)]
+
+
+def read(settings: RunsSettings, *, refuse: bool = True) -> ReadRuns:
+    """Return the runs of the settings, with what is doubtful about them.
+
+    Parameters
+    ----------
+    settings : with ``repair``, implausible runs are taken as they are, and count which checks they do not pass
+    refuse : implausible runs; where a command only states them they are taken and not counted
 
     Raises
     ------
     LogError
-        if nothing readable is there, a run cannot be read, two runs have one id, layouts are mixed, or a
-        terrain has two spellings.
+        if nothing readable is there, a run cannot be read or is implausible, two runs have one id, layouts are
+        mixed, or a terrain has two spellings.
     ConfigError
         if the mapping is not accepted, or a robot is unknown (to align, or to turn motor rates into wheel
         speeds).
@@ -163,7 +199,23 @@ def load(settings: RunsSettings) -> tuple[list[RunLog], list[str]]:
     runs = sorted(one_spelling(str(folder), runs, repair=repair), key=attrgetter("run_id"))
     if isinstance(settings, AlignedRunsSettings):
         runs = chosen_runs(runs, settings)
-    return runs, skipped
+    robot = named_robot(settings)
+    verdicts = {run.run_id: verdict(run, robot) for run in runs}
+    doubts = doubts_of(verdicts)
+    if repair:
+        runs = [counted(run, verdicts[run.run_id]) for run in runs]
+    elif refuse:
+        refuse_implausible_runs(doubts, {run.run_id: run.dropped for run in runs})
+    return ReadRuns(runs, skipped, doubts, verdicts)
+
+
+def named_robot(settings: RunsSettings) -> Robot | None:
+    """Return the robot that the settings name."""
+    if settings.robot is None:
+        return None
+    from terrain.robots import load_robot
+
+    return load_robot(settings.robot)
 
 
 def run_loaders(settings: RunsSettings) -> list[RunLoader]:
@@ -172,13 +224,9 @@ def run_loaders(settings: RunsSettings) -> list[RunLoader]:
     Raises
     ------
     LogError, ConfigError
-        as :func:`load`, where no run is found or a setting is not accepted.
+        as :func:`read`, where no run is found or a setting is not accepted.
     """
-    robot = None
-    if settings.robot is not None:
-        from terrain.robots import load_robot
-
-        robot = load_robot(settings.robot)
+    robot = named_robot(settings)
     readers = _readers(settings.data, settings.layout, settings.mapping, robot)
     if not readers:
         raise LogError(f"{settings.data}: holds no run; {ACCEPTED}")
@@ -194,7 +242,6 @@ def verdict(run: RunLog, robot: Robot | None = None) -> tuple[Check, ...]:
     run : as a reader returns it
     robot : that the user named; where the run names another, that of the package
     """
-    from terrain.logs.plausibility import Scale, judge
     from terrain.robots import robot_named
 
     try:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipelines.data.datasets import load, verdict
+from pipelines.data.datasets import named_robot, read
 from pipelines.data.settings import RunsSettings
 from pipelines.report.numbers import format_counts, format_value, plural
 from pipelines.report.results import Progress, Result, described, silent
@@ -88,10 +88,10 @@ def run(settings: Settings, progress: Progress = silent) -> Inspection:
     from terrain.logs.duplicates import shared_stretches
     from terrain.logs.plausibility import stream_quality
     from terrain.logs.run_folders import data_digest
-    from terrain.robots import load_robot, robot_named
+    from terrain.robots import robot_named
 
-    runs, skipped = load(settings)
-    robot = None if settings.robot is None else load_robot(settings.robot)
+    runs, skipped, _, verdicts = read(settings, refuse=False)
+    robot = named_robot(settings)
     inspected = []
     for done, each in enumerate(runs, 1):
         try:
@@ -100,7 +100,7 @@ def run(settings: Settings, progress: Progress = silent) -> Inspection:
             clock = None
         streams = {name: stream_quality(stream) for name, stream in each.streams.items()}
         about = each.run_id, each.terrains, dict(each.dropped), streams, clock
-        inspected.append(InspectedRun(*about, odd_stretches(each), verdict(each, robot)))
+        inspected.append(InspectedRun(*about, odd_stretches(each), verdicts[each.run_id]))
         progress("inspect", done, len(runs))
     return Inspection(len(runs), data_digest(runs), tuple(skipped), tuple(inspected), shared_stretches(runs))
 

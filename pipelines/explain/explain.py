@@ -65,11 +65,12 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
 
     if settings.against is not None and settings.against.resolve() == settings.data.resolve():
         raise ConfigError("--against is the folder of --data; a set of runs does not differ from itself")
-    runs, skipped = load(settings)
+    runs, skipped, doubts = load(settings)
     others: list[RunLog] = []
     if settings.against is not None:
-        others, more = load(settings.model_copy(update={"data": settings.against, "only": (), "without": ()}))
-        skipped = [*skipped, *more]
+        asked = settings.model_copy(update={"data": settings.against, "only": (), "without": ()})
+        others, more, further = load(asked)
+        skipped, doubts = [*skipped, *more], [*doubts, *further]
     out, model = settings.out, settings.model
     robot = tested = load_robot(settings.robot)
     if model is not None:
@@ -104,7 +105,7 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
         n_pictures=None if settings.pictures == "all" else int(settings.pictures),
         page=out / PAGE_FILE,
         extended_file=extended_file if found.is_extended else None,
-    )
+    ).with_doubts(doubts)
     if result.extended_file is not None:
         effects = extended_effects(tested, result.diagnosis)
         sources, about = sources_of(result.diagnosis, settings.dataset or "a data set"), result.extended

@@ -23,7 +23,7 @@ from features.extractor import FeatureExtractor
 from features.motion import window_motion
 from features.protocols import Samples
 from features.windows import Layout, WindowCut, WindowRule, cut_windows, labelled, layout_of, wheel_stream
-from pipelines.data.datasets import RunLoader, run_loaders
+from pipelines.data.datasets import RunLoader, run_loaders, verdict
 from pipelines.data.settings import AlignedRunsSettings, chosen_runs
 from pipelines.learn.parallel import parallel
 from pipelines.learn.recipes import recipe_of
@@ -36,10 +36,19 @@ from terrain.classify.limits import Motion
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.files.atomic import atomic_file, ensure_writable
 from terrain.logs.duplicates import RunPrint, possible_pairs, run_print, sentences, shared_stretches
+from terrain.logs.plausibility import (
+    Check,
+    Doubt,
+    Level,
+    counted,
+    doubt_sentences,
+    doubts_of,
+    refuse_implausible_runs,
+)
 from terrain.logs.run_folders import data_digest, joint_digest
 from terrain.records import WINDOW_COLUMNS, Array, RunLog, Stream, Windows
 
-FORMAT_VERSION = 7
+FORMAT_VERSION = 8
 
 
 class RunHead(NamedTuple):
@@ -54,6 +63,7 @@ class RunHead(NamedTuple):
     repaired: Mapping[str, int] = {}  #: what a repairing reader dropped, as counts by kind
     print_digest: str = ""  #: of its samples, see :class:`~terrain.logs.duplicates.RunPrint`
     fault: str = ""  #: why it was skipped; empty of one that was read
+    doubts: Sequence[Sequence[Any]] = ()  #: fields of the checks that are doubtful or implausible
     session: str = ""
 
     def sketch(self) -> RunLog:
@@ -72,7 +82,7 @@ def loaders_of(source: AlignedRunsSettings) -> list[RunLoader]:
 
 def cached_data(
     loaders: Sequence[RunLoader], settings: LearnSettings, cache_dir: Path, progress: Progress = silent
-) -> tuple[TrainingData, list[str]]:
+) -> tuple[TrainingData, list[str], list[str]]:
     """Return the labelled windows of runs by their features, out of a cache as far as they are there.
 
     Parameters
@@ -87,11 +97,12 @@ def cached_data(
     data : with windows without their samples; its digest is over those of the runs, as that of the runs read
         whole needs all at once
     skipped : a sentence for each run that could not be read
+    doubtful : a sentence for each doubt about the others
 
     Raises
     ------
     LogError
-        if a run cannot be read, or two runs have one id.
+        if a run cannot be read or is implausible, or two runs have one id.
     DataError
         if the runs have no channels or rates in common, two hold the same measurements, or no window has a
         label.
@@ -106,6 +117,13 @@ def cached_data(
     skipped = [f"run skipped: {head.fault}" for head in heads if head.fault]
     readable = [head for head in heads if not head.fault]
     chosen = chosen_runs(readable, settings) if isinstance(settings, AlignedRunsSettings) else readable
+    doubts = [
+        Doubt(head.run_id, Check(*check)._replace(level=Level(check[1])))
+        for head in sorted(chosen, key=lambda head: head.run_id)
+        for check in head.doubts
+    ]
+    if not any(load.repair for load in loaders):
+        refuse_implausible_runs(doubts, {head.run_id: head.repaired for head in chosen})
     used = {head.run_id for head in chosen}
     load_of = dict(zip([head.run_id or str(i) for i, head in enumerate(heads)], loaders, strict=True))
     each = [(load_of[a], load_of[b]) for a, b in pairs if {a, b} <= used]
@@ -131,7 +149,8 @@ def cached_data(
     motion = None if wheel_stream(layout.channels) is None else moved
     runs = trained_runs([head[:4] for head in chosen], samples)
     digest = joint_digest([head.digest for head in chosen])
-    return TrainingData(samples, layout, unfitted, features, motion, runs, digest), skipped
+    data = TrainingData(samples, layout, unfitted, features, motion, runs, digest)
+    return data, skipped, [*doubt_sentences(doubts)]
 
 
 def _heads(
@@ -174,7 +193,9 @@ def _head(place: Path, load: RunLoader) -> tuple[RunHead, Array, Array]:
             raise
         nothing = np.zeros(0)
         return RunHead("", fault=str(error)), nothing.astype(np.int64), nothing
-    prints = run_print(run)
+    prints, checks = run_print(run), verdict(run, load.robot)
+    if load.repair:
+        run = counted(run, checks)
     head = RunHead(
         run.run_id,
         run.robot,
@@ -184,6 +205,7 @@ def _head(place: Path, load: RunLoader) -> tuple[RunHead, Array, Array]:
         dict(run.dropped),
         prints.digest.hex(),
         session=run.session,
+        doubts=[tuple(doubt.check) for doubt in doubts_of({run.run_id: checks})],
     )
     if file is not None:
         _write(file, head._asdict(), code=prints.codes, time_s=prints.time_s)

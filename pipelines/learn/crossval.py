@@ -51,13 +51,13 @@ def run(settings: Settings, progress: Progress = silent) -> CrossvalResult | Com
             from pipelines.learn.cache import cached_data, loaders_of
             from pipelines.learn.evaluate import evaluate_recipe
 
-            data, skipped = cached_data(loaders_of(settings), settings, settings.cache, progress)
+            data, skipped, doubts = cached_data(loaders_of(settings), settings, settings.cache, progress)
             (name,), computed, digest = settings.recipes, (data.rows, data.motion), data.digest
             found, _ = evaluate_recipe(data.recipe, name, data.samples, settings, progress, computed)
         else:
             from terrain.logs.run_folders import data_digest
 
-            runs, skipped = load(settings)
+            runs, skipped, doubts = load(settings)
             asked, digest = settings.with_(skip_short=settings.repair), data_digest(runs)
             if settings.model:
                 from pipelines.learn.comparison import compare_models
@@ -66,6 +66,7 @@ def run(settings: Settings, progress: Progress = silent) -> CrossvalResult | Com
             else:
                 found = crossval(runs, asked, progress)
     named = replace(found, dataset=settings.dataset, data_digest=digest, data=str(settings.data))
+    named = named.with_doubts(doubts)
     return replace(named, skipped=tuple(skipped)) if isinstance(named, CrossvalResult) else named
 
 

@@ -150,13 +150,14 @@ def _propose(settings: Settings, model_uri: str) -> ProposalsResult:
     """Write the proposals of a model for the runs of a folder as CSV with empty answers, the questions first."""
     import pandas as pd
 
-    from pipelines.data.datasets import load_runs
+    from pipelines.data.datasets import load
+    from pipelines.data.settings import RunsSettings
     from pipelines.live.assess import assess
     from pipelines.live.windows import prior_of, windows_of_log
     from terrain.classify.proposals import propose, questions, taken_from
     from terrain.files.atomic import atomic_write
 
-    model, runs = settings.read_model(model_uri), load_runs(settings.data)
+    model, (runs, _, doubts) = settings.read_model(model_uri), load(RunsSettings(data=settings.data))
     of_model = model.info.classes, prior_of(model.info)
     proposals: list[Proposal] = []
     for run in runs:
@@ -178,7 +179,8 @@ def _propose(settings: Settings, model_uri: str) -> ProposalsResult:
     atomic_write(settings.proposals, table.to_csv(index=False, float_format="%.6g"))
     n_taken, words = sum(each.taken_over for each in proposals), taken_over_words(model.info, settings.error)
     counts = len(runs), len(asked), n_taken
-    return ProposalsResult(settings.data, settings.proposals, *counts, words, tuple(proposals))
+    result = ProposalsResult(settings.data, settings.proposals, *counts, words, tuple(proposals))
+    return result.with_doubts(doubts)
 
 
 def taken_over_words(info: ModelInfo, error: float) -> str:
@@ -208,7 +210,8 @@ def _write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult
 
     A person's answer stands above a label that a run has, and that above a proposal of the model.
     """
-    from pipelines.data.datasets import load_runs
+    from pipelines.data.datasets import load
+    from pipelines.data.settings import RunsSettings
     from terrain.classify.proposals import LabelSource, label_of, with_label
     from terrain.files.atomic import atomic_folder
     from terrain.logs.run_folders import write_run
@@ -216,7 +219,7 @@ def _write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult
 
     if out.exists():
         raise ConfigError(f"{out}: exists already; the runs are written to a folder of their own")
-    runs = load_runs(settings.data)
+    runs, _, doubts = load(RunsSettings(data=settings.data))
     labels = {run.run_id: [LabelSource(*label, "measured", None) for label in run.labels] for run in runs}
     left_open = 0
     for proposal, answer in _checked_answers(answers, runs, new_class=settings.new_class):
@@ -238,7 +241,8 @@ def _write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult
             text = json.dumps(sources, indent=2, allow_nan=False) + "\n"
             labelled = replace(run, labels=tuple(Label(*each[:3]) for each in of_run))
             write_run(labelled, folder, beside={SOURCES_FILE: text})
-    return AnswersResult(out, len(runs), dict(sorted(counts.items())), left_open, written)
+    found = AnswersResult(out, len(runs), dict(sorted(counts.items())), left_open, written)
+    return found.with_doubts(doubts)
 
 
 def _checked_answers(file: Path, runs: Sequence[RunLog], *, new_class: bool) -> list[tuple[Proposal, str]]:

@@ -184,10 +184,10 @@ def run(settings: Settings, progress: Progress = silent) -> Predictions | Change
 def _changes(settings: Settings, progress: Progress) -> ChangesResult:
     from pipelines.learn.ground_changes import find_changes
 
-    runs, skipped = load(settings)
-    quiet, skipped_quiet = load(settings.with_(data=settings.changes, only=(), without=()))
+    runs, skipped, doubts = load(settings)
+    quiet, skipped_quiet, more = load(settings.with_(data=settings.changes, only=(), without=()))
     found = find_changes(runs, quiet, settings.robot, settings.false_alarms, progress)
-    return replace(found, skipped=(*skipped, *skipped_quiet))
+    return replace(found, skipped=(*skipped, *skipped_quiet)).with_doubts([*doubts, *more])
 
 
 def _predictions(settings: Settings) -> Predictions:
@@ -197,7 +197,7 @@ def _predictions(settings: Settings) -> Predictions:
     from terrain.robots import load_robot
 
     table = load_slip_table(settings.table)
-    runs, skipped = load(settings)
+    runs, skipped, doubts = load(settings)
     robot = None if settings.robot is None else load_robot(settings.robot)
     model = filtered(settings.read_model(settings.model), settings.filter_stride_s)
     if settings.adapt in ("", "start", "spread", "none"):
@@ -205,7 +205,8 @@ def _predictions(settings: Settings) -> Predictions:
     else:
         model = _adapted(model, settings, robot)
     found = predict(runs, model, table, robot=robot, skip_short=settings.repair)
-    return replace(found, model=settings.model, dataset=settings.dataset, skipped=tuple(skipped))
+    found = replace(found, model=settings.model, dataset=settings.dataset, skipped=tuple(skipped))
+    return found.with_doubts(doubts)
 
 
 def _adapted(model: TerrainModel, settings: Settings, robot: Robot | None) -> TerrainModel:
@@ -213,7 +214,7 @@ def _adapted(model: TerrainModel, settings: Settings, robot: Robot | None) -> Te
     from features.windows import join_windows
     from pipelines.live.windows import windows_of_log
 
-    reference, _ = load(settings.with_(data=Path(settings.adapt), only=(), without=()))
+    reference, *_ = load(settings.with_(data=Path(settings.adapt), only=(), without=()))
     cuts = [windows_of_log(each, model.info, robot, skip_short=True) for each in reference]
     return model.adapt(join_windows([cut.windows for cut in cuts]), settings.adapt_terrain)
 

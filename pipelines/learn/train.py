@@ -123,14 +123,14 @@ def run(settings: Settings, progress: Progress = silent) -> Registered:
     asked = settings.with_(skip_short=settings.repair)
     with computing(settings.compute):
         if settings.cache is None:
-            runs, skipped = load(settings)
+            runs, skipped, doubts = load(settings)
             data = data_of_runs(runs, asked)
         else:
             from pipelines.learn.cache import cached_data, loaders_of
 
-            data, skipped = cached_data(loaders_of(settings), asked, settings.cache, progress)
+            data, skipped, doubts = cached_data(loaders_of(settings), asked, settings.cache, progress)
         found = train(data, asked, settings.dataset, progress)
-    return replace(found, skipped=tuple(skipped))
+    return replace(found, skipped=tuple(skipped)).with_doubts(doubts)
 
 
 def train(

@@ -6,7 +6,7 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, dataclass_transform
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from pipelines.report.tree import Report
+
+MAX_DOUBTS = 6  #: A page begins with so many doubts; the others are folded
 
 Progress = Callable[[str, int, int], None]
 """Called with the task, how many of its steps are done, and how many there are."""
@@ -88,12 +90,13 @@ def write_json(path: Path, result: Any) -> None:
 
 
 @dataclass_transform(frozen_default=True)
+@dataclass(frozen=True, repr=False)
 class Result:
     """Base of the results of commands: what derives from it is a frozen dataclass by that, with the options of one.
 
     The module that defines a result has a function ``report(result)``; screen, page and notebook show what it
-    returns.  The fields are the keys of ``--json``; one that is not :func:`described` is none of them, as the
-    pictures that a report shows.
+    returns, below what is doubtful about the runs that were read.  The fields are the keys of ``--json``; one
+    that is not :func:`described` is none of them, as the pictures that a report shows.
 
     Examples
     --------
@@ -101,9 +104,21 @@ class Result:
     ...     length_m: float = described("of the path", "m")
     >>> Length(1.5).as_json(), Length.of(Length(2.5)).length_m
     ({'length_m': 1.5}, 2.5)
-    >>> Length.schema()["properties"]
-    {'length_m': {'description': 'of the path', 'unit': 'm'}}
+    >>> Length.schema()["properties"]["length_m"]
+    {'description': 'of the path', 'unit': 'm'}
     """
+
+    #: on the runs that were read
+    doubtful: tuple[str, ...] | None = field(
+        default=None,
+        kw_only=True,
+        metadata=described("what is doubtful about runs that were read", optional=True).metadata,
+    )
+
+    def with_doubts(self, sentences: Iterable[str]) -> Self:
+        """Return the result of runs about which something is doubtful, a sentence each; nothing of none."""
+        doubtful = tuple(sentences)
+        return replace(self, doubtful=doubtful) if doubtful else self
 
     @classmethod
     def of(cls, *sources: Any, **values: Any) -> Self:
@@ -111,7 +126,7 @@ class Result:
 
         A field with a default is that, unless its value is given.
         """
-        all_fields = fields(cls)  # type: ignore[arg-type]
+        all_fields = fields(cls)
         needed = {each.name for each in all_fields if each.default is each.default_factory is MISSING}
         for source in sources:
             names = [name for name in needed - values.keys() if hasattr(source, name)]
@@ -122,7 +137,15 @@ class Result:
     def report(self) -> Report:
         """What screens, pages and notebooks show."""
         made: Report = sys.modules[type(self).__module__].report(self)
-        return made
+        if not self.doubtful:
+            return made
+        from pipelines.report.tree import Text, sections
+
+        first, more = self.doubtful[:MAX_DOUBTS], self.doubtful[MAX_DOUBTS:]
+        warned = (*(Text(each, "warning") for each in first), *made.parts)
+        return replace(
+            made, parts=warned, details=(*made.details, *sections(("More doubts on the runs", more)))
+        )
 
     def as_json(self) -> Any:
         """Return the fields by name, as :func:`as_json` writes them."""
@@ -157,7 +180,7 @@ class Result:
     @classmethod
     def about(cls) -> dict[str, Mapping[str, Any]]:
         """Return what :func:`described` was given for each field, by its name."""
-        return {each.name: each.metadata for each in fields(cls) if each.metadata}  # type: ignore[arg-type]
+        return {each.name: each.metadata for each in fields(cls) if each.metadata}
 
     @classmethod
     def schema(cls) -> dict[str, Any]:

@@ -163,7 +163,7 @@ def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
     assert settings.replay is not None
     table, model = load_slip_table(settings.table), loaded(settings, settings.model)
     read = {name: getattr(settings, name) for name in ("robot", *ReadSettings.model_fields)}
-    logs, skipped = load(InspectSettings(data=settings.replay, **read))
+    logs, skipped, doubts = load(InspectSettings(data=settings.replay, **read), refuse=False)
     robot = None if settings.robot is None else load_robot(settings.robot)
     watch, blocks = None, list[WatchedBlock]()
     if settings.watch is not None:
@@ -199,7 +199,7 @@ def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
         watch_doubt="" if watch is None else watch.watched.doubt,
         alarms=() if watch is None else tuple(watch.alarms),
         blocks=tuple(blocks),
-    )
+    ).with_doubts(doubts)
 
 
 def chain_of_run(
@@ -349,7 +349,7 @@ def report(result: ReplayResult) -> Report:
             f"{plural(len(result.alarms), 'departure')} from {result.watch} in {compared * BLOCK_S:.0f} s of driving "
             f"that could be compared, of {result.duration_s:.0f} s."
         )
-    notes = [Text(f"skipped: {sentence}", "warning") for sentence in result.skipped]
+    notes = [Text(sentence, "warning") for sentence in result.skipped]
     if result.interrupted:
         notes.insert(0, Text("stopped before the end", "note"))
     return Report(

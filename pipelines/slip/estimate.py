@@ -179,7 +179,7 @@ def run(settings: Settings, progress: Progress) -> TracksResult:
     from terrain.logs.run_folders import run_folder, write_run
     from terrain.robots import load_robot
 
-    runs, skipped = load(settings)
+    runs, skipped, doubts = load(settings)
     out, figures = settings.out, settings.figures
     for folder in (out, figures):
         if folder is not None:
@@ -200,7 +200,7 @@ def run(settings: Settings, progress: Progress) -> TracksResult:
     found: dict[str, Any] = {"out": out, "skipped": tuple(skipped)}
     if figures is not None and of_runs is None:
         found["figures"] = write_figures(result.pictures, figures)
-    return replace(result, **found)
+    return replace(result, **found).with_doubts(doubts)
 
 
 def _estimated(

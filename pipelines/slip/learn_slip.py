@@ -38,7 +38,7 @@ def run(settings: Settings, progress: Progress) -> LearnedSlipTable:
     from terrain.robots import SwerveRobot, load_robot
 
     robot = load_robot(settings.robot)
-    runs, skipped = load(settings)
+    runs, skipped, doubts = load(settings)
     check_file(settings.out, "--out")
     if settings.figures is not None:
         ensure_writable(settings.figures)
@@ -53,7 +53,7 @@ def run(settings: Settings, progress: Progress) -> LearnedSlipTable:
     files = () if settings.figures is None else write_figures(table.pictures, settings.figures)
     written = replace(
         table, table=settings.out, dataset=settings.dataset, figures=files, skipped=(*skipped, *table.skipped)
-    )
+    ).with_doubts(doubts)
     if isinstance(written, LearnedCurves):
         log_curves(written)
     return written

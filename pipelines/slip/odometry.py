@@ -58,7 +58,7 @@ def calibrate(settings: Settings, progress: Progress) -> OdometryResult:
         if fewer runs than folds have poses.
     """
     assert settings.robot is not None
-    runs, _ = load(settings)
+    runs, _, doubts = load(settings)
     refusal = "robot {name}: drive {drive!r} has no tracks; --what odometry is for 'tracked'"
     robot = as_drive(TrackedRobot, load_robot(settings.robot), refusal)
     if settings.out is not None:
@@ -71,7 +71,8 @@ def calibrate(settings: Settings, progress: Progress) -> OdometryResult:
     if settings.out is not None:
         write_slip_model(settings.out, model, robot.name)
     notes = (FLAT,) if flat else ()
-    return OdometryResult.of(settings, **figures, robot=robot.name, written=settings.out, notes=notes)
+    found = OdometryResult.of(settings, **figures, robot=robot.name, written=settings.out, notes=notes)
+    return found.with_doubts(doubts)
 
 
 KINDS = (

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from pipelines.data.datasets import load_runs
+from pipelines.data.datasets import load
 from pipelines.report.numbers import plural
 from pipelines.report.results import Progress, Result, described
 from pipelines.report.settings import check_file
@@ -64,13 +64,8 @@ def calibrate(settings: Settings, progress: Progress) -> CalibrationResult:
         check_file(out, "--out", (".yaml", ".yml"))
         if out.exists():
             raise ConfigError(f"{out}: is there already, and is left as it is; choose another --out")
-    runs = load_runs(
-        settings.data,
-        layout=settings.layout,
-        mapping=settings.mapping,
-        repair=settings.repair,
-        robot=settings.robot if robot.skids else None,
-    )
+    of_logs = settings.robot if robot.skids else None
+    runs, _, doubts = load(settings.model_copy(update={"robot": of_logs}))
     grounds = hard_grounds() if settings.hard is None else settings.hard
     findings = findings_of(runs, description, robot, grounds)
     if not any(finding.determined for finding in findings):
@@ -93,7 +88,7 @@ def calibrate(settings: Settings, progress: Progress) -> CalibrationResult:
         run_ids=tuple(run.run_id for run in runs),
         findings=tuple(findings),
         measurement_variances=variances,
-    )
+    ).with_doubts(doubts)
 
 
 def _sample(finding: Finding) -> str:

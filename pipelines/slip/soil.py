@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.data.datasets import load, load_runs
+from pipelines.data.datasets import load
 from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from pipelines.report.numbers import format_value
 from pipelines.report.results import Progress, Result, described
@@ -78,14 +78,15 @@ def calibrate(settings: Settings, progress: Progress) -> SoilResult:
     TerrainError
         if a folder cannot be written.
     """
-    runs, skipped = load(settings)
+    runs, skipped, doubts = load(settings)
     out = settings.out
     for folder in (out, settings.figures):
         if folder is not None:
             ensure_writable(folder)
     further: Sequence[RunLog] = ()
     if (check := settings.check) is not None:
-        further = load_runs(check, layout=settings.layout, repair=settings.repair)
+        further, _, more = load(settings.model_copy(update={"data": check, "robot": None, "mapping": None}))
+        doubts += more
     for folder, given in ((settings.data, runs), (check, further)):
         if given and not any(run.robot in WHEELS for run in given):
             raise DataError(
@@ -122,7 +123,7 @@ def calibrate(settings: Settings, progress: Progress) -> SoilResult:
         files=tuple(files),
         skipped=tuple(skipped),
         pictures=pictures,
-    )
+    ).with_doubts(doubts)
 
 
 def report(result: SoilResult) -> Report:

@@ -20,7 +20,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import replace
 from enum import StrEnum
 from typing import NamedTuple
@@ -521,23 +521,35 @@ def doubts_of(verdicts: Mapping[str, Sequence[Check]]) -> tuple[Doubt, ...]:
     return tuple(doubt for doubt in doubts if doubt.check.level in (DOUBTFUL, IMPLAUSIBLE))
 
 
-def refuse_implausible_runs(doubts: Sequence[Doubt]) -> None:
-    """Raise :class:`LogError` with the first implausible check, and how many there are."""
-    found = [doubt for doubt in doubts if doubt.check.level == Level.IMPLAUSIBLE]
+def refuse_implausible_runs(doubts: Sequence[Doubt], accepted: Mapping[str, Container[str]]) -> None:
+    """Raise :class:`LogError` with the first implausible check, and how many there are.
+
+    ``accepted`` has by run what was counted when it was read with ``--repair``: that was decided, and is only stated.
+    """
+    found = [
+        doubt
+        for doubt in doubts
+        if doubt.check.level == IMPLAUSIBLE and _kind(doubt.check) not in accepted.get(doubt.run_id, ())
+    ]
     if not found:
         return
     runs = len({doubt.run_id for doubt in found})
     more = f" ({len(found)} such findings in {runs} run{'s' * (runs > 1)})" if len(found) > 1 else ""
     raise LogError(
         f"{found[0].run_id}: implausible {found[0].check.sentence}{more}; mend it where it is read, by a "
-        "mapping, say, or import it as it is, and counted, with --repair"
+        "mapping, say, or take it as it is, and counted, with --repair"
     )
+
+
+def _kind(check: Check) -> str:
+    return f"implausible {check.check}"
 
 
 def counted(run: RunLog, checks: Sequence[Check]) -> RunLog:
     """Return a run that states among what was dropped or changed which checks it does not pass."""
-    odd = Counter(f"implausible {check.check}" for check in checks if check.level == Level.IMPLAUSIBLE)
-    return replace(run, dropped=Counter(run.dropped) + odd) if odd else run
+    odd = Counter(_kind(check) for check in checks if check.level == IMPLAUSIBLE)
+    new = {kind: n for kind, n in odd.items() if kind not in run.dropped}
+    return replace(run, dropped=dict(run.dropped) | new) if new else run
 
 
 def doubt_sentences(doubts: Sequence[Doubt]) -> Iterator[str]:

@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MAX_LINES = {"terrain": 53_600, "features": 2_750, "pipelines": 19_400, "tests": 48_550}
+MAX_LINES = {"terrain": 53_950, "features": 2_750, "pipelines": 19_520, "tests": 48_850}
 """Lines of Python, docstrings included."""
 
 

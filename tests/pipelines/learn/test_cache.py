@@ -44,7 +44,7 @@ def cached(runs_dir, tmp_path):
         def progress(task, done, total):
             left.extend([total - done] if task == "features" else [])
 
-        return *cached_data(loaders, settings, tmp_path / folder, progress), left[0]
+        return *cached_data(loaders, settings, tmp_path / folder, progress)[:2], left[0]
 
     return cached
 
