@@ -536,8 +536,8 @@ def refuse_implausible_runs(doubts: Sequence[Doubt], accepted: Mapping[str, Cont
     runs = len({doubt.run_id for doubt in found})
     more = f" ({len(found)} such findings in {runs} run{'s' * (runs > 1)})" if len(found) > 1 else ""
     raise LogError(
-        f"{found[0].run_id}: implausible {found[0].check.sentence}{more}; mend it where it is read, by a "
-        "mapping, say, or take it as it is, and counted, with --repair"
+        f"{found[0].run_id}: implausible {found[0].check.sentence}{more} (mend it where it is "
+        "read, by a mapping, say, or take it as it is, and counted, with --repair)"
     )
 
 

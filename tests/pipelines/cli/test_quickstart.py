@@ -32,7 +32,7 @@ def test_the_runs_that_are_predicted_took_no_part(in_tracked, drive_all, tmp_pat
     assert {each.run_id for each in result.crossval.per_run} == {each.run_id for each in training}
     assert [" --without ASPHALT_3" in step for step in result.commands] == [True, True, False]
     assert result.commands[-1].endswith(" --only ASPHALT_3")
-    loaded, _ = load(AlignedRunsSettings(data=tmp_path / "data", without=("ASPHALT_3",)))
+    loaded, *_ = load(AlignedRunsSettings(data=tmp_path / "data", without=("ASPHALT_3",)))
     assert data_digest(loaded) == result.data_digest
 
     page = result.report_file.read_text()

@@ -1,0 +1,100 @@
+"""One gate for data: what cannot be right is refused by every command in the same sentence, what is doubtful stated."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import terrain as face
+from terrain.errors import DoubtfulRunWarning, LogError
+from terrain.logs.run_folders import write_run
+from terrain.records import Stream
+
+HUSKY = ("--robot", "husky")
+COMMANDS = {
+    "convert": ("convert", "data", "--out", "out"),
+    "convert --to csv": ("convert", "data", "--to", "csv", "--out", "out"),
+    "estimate": ("estimate", "--data", "data", "--filter", "skid"),
+    "calibrate": ("calibrate", "--data", "data", *HUSKY),
+    "crossval": ("crossval", "--data", "data"),
+    "train": ("train", "--data", "data", "--name", "model"),
+    "predict": ("predict", "--data", "data", "--model", "none"),
+    "predict --changes": ("predict", "--data", "data", "--changes", "data"),
+    "learn-slip": ("learn-slip", "--data", "data", *HUSKY, "--out", "table.yaml"),
+    "explain": ("explain", "--data", "data", *HUSKY, "--out", "out"),
+    "quickstart": ("quickstart", "--data", "data", "--out", "out"),
+}
+
+
+def with_imu(run, **factors):
+    """Return a run with channels of the IMU multiplied."""
+    imu = run.streams["imu"]
+    values = imu.values * [factors.get(channel, 1.0) for channel in imu.channels]
+    return replace(run, streams={**run.streams, "imu": replace(imu, values=values)})
+
+
+def accel(factor):
+    return {f"accel_{axis}_mps2": factor for axis in "xyz"}
+
+
+SENTENCE = (
+    "r: implausible gravity: the mean specific force is 0.981 m/s^2, 9.81 is expected: an accelerometer in g read as "
+    "m/s^2? (mend it where it is read, by a mapping, say, or take it as it is, and counted, with --repair)"
+)
+
+
+@pytest.fixture
+def in_g(place, drive):
+    """The folder to work in, with a run in ``data`` whose accelerometer is in g."""
+    write_run(with_imu(drive("r", "GRASS", 0, duration_s=8.0), **accel(1 / 9.81)), place / "data")
+    return place
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_refuses_an_implausible_run_in_the_same_sentence(refused, in_g, command):
+    refused(SENTENCE, *COMMANDS[command])
+
+
+def test_python_and_a_cache_refuse_it_too(terrain, in_g):
+    for _ in range(2):  # read, and from the cache
+        code, out, err = terrain("crossval", "--data", "data", "--cache", "cache")
+        assert (code, out, err.splitlines()[-1]) == (2, "", f"error: {SENTENCE}")
+    with pytest.raises(LogError) as error:
+        face.load_runs(in_g / "data")
+    assert str(error.value) == SENTENCE
+
+
+def test_a_run_that_was_taken_as_it_is_is_stated_and_no_longer_refused(terrain, in_g, model_dir):
+    """``--repair`` is the one option, of every command; what it decided stays with the run."""
+    assert terrain("convert", "data", "--out", "runs", "--repair")[0] == 0
+    code, out, _ = terrain("estimate", "--data", "runs", "--filter", "skid", "--json", "found.json")
+    assert code == 0
+    (stated,) = json.loads((in_g / "found.json").read_text())["doubtful"]
+    assert stated == "r: implausible" + SENTENCE.partition("implausible")[2].partition(" (mend")[0]
+    assert "implausible gravity" in " ".join(out.split())
+    assert dict(face.load_runs(in_g / "runs", repair=True)[0].dropped) == {"implausible gravity": 1}
+    code, out, err = terrain("label", "data", "--model", model_dir, "--proposals", "new.csv")
+    assert (code, out, err) == (2, "", f"error: {SENTENCE}\n")
+    code, out, _ = terrain("serve", "--replay", "data", "--model", model_dir, "--json", "found.json")
+    assert (code, "an accelerometer in g" in " ".join(out.split())) == (0, True)  # stated, and not ended
+    code, out, _ = terrain("inspect", "data")  # which states and does not refuse
+    assert (code, "an accelerometer in g" in " ".join(out.split())) == (0, True)
+
+
+def test_a_doubt_is_stated_on_the_screen_in_the_result_and_on_the_page(terrain, place, drive):
+    tilted = drive("r", "GRASS", 0, duration_s=8.0)
+    imu = tilted.streams["imu"]
+    turn = np.eye(6)
+    turn[3:, 3:] = [[np.cos(0.6), 0, -np.sin(0.6)], [0, 1, 0], [np.sin(0.6), 0, np.cos(0.6)]]
+    imu = Stream(imu.time_s, imu.values @ turn.T, imu.channels)
+    write_run(replace(tilted, streams={**tilted.streams, "imu": imu}), place / "data")
+    found = ("--json", "found.json", "--report", "page.html")
+    code, out, _ = terrain("estimate", "--data", "data", "--filter", "skid", *found)
+    (doubt,) = json.loads((place / "found.json").read_text())["doubtful"]
+    assert code == 0
+    assert doubt.endswith("mostly along +z is expected: a tilted sensor, or a steep slope?")
+    assert "a tilted sensor, or a steep slope?" in " ".join(out.split())
+    assert "a tilted sensor, or a steep slope?" in (place / "page.html").read_text()
+    with pytest.warns(DoubtfulRunWarning, match="a tilted sensor"):
+        face.load_runs(place / "data")
