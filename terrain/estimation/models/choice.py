@@ -9,6 +9,7 @@ from typing import Any
 from terrain.errors import ConfigError
 from terrain.estimation.models import sideslip
 from terrain.estimation.models.observer import Observer
+from terrain.estimation.models.slip import SlipFilter
 from terrain.estimation.models.slip_model import SlipModel, unknown_ground
 from terrain.estimation.models.slip_odometry import SlipOdometry, plain_odometry
 from terrain.estimation.models.tracked import TrackedObserver
@@ -22,21 +23,25 @@ def _sideslip(name: str, robot: BicycleRobot, _: SlipModel) -> Observer:
     return sideslip.Sideslip(robot, name)
 
 
+_SLIP: Mapping[str, Callable[[Any, SlipModel], Observer]] = {"slip": lambda robot, _: SlipFilter(robot)}
+
 OBSERVERS_OF_DRIVE: Mapping[str, Mapping[str, Callable[[Any, SlipModel], Observer]]] = {
+    **dict.fromkeys(("skid_steer", "omni", "mecanum", "tricycle"), _SLIP),
     "tracked": {
+        **_SLIP,
         "tracked": lambda robot, _: TrackedObserver(robot),
         "slip-odometry": SlipOdometry,
         "slip-learning": lambda robot, _: SlipOdometry(robot, unknown_ground(), name="slip-learning"),
         **{name: partial(plain_odometry, name) for name in PLAIN},
     },
-    "bicycle": {name: partial(_sideslip, name) for name in sideslip.SETTINGS},
+    "bicycle": {**_SLIP, **{name: partial(_sideslip, name) for name in sideslip.SETTINGS}},
 }
 """Observers of each drive, from a robot and its slip model."""
 
 BY_MODEL = ("slip-odometry", "endo")
 """Observers that are nothing without a slip model."""
 
-OBSERVERS: tuple[str, ...] = tuple(name for known in OBSERVERS_OF_DRIVE.values() for name in known)
+OBSERVERS: tuple[str, ...] = tuple(dict.fromkeys(name for known in OBSERVERS_OF_DRIVE.values() for name in known))
 """Names of all observers."""
 
 

@@ -1,6 +1,6 @@
 """Observers of slip: one row of measurements in, what is known of the slip out; and what a row is made of.
 
-A row holds what was measured at a tick of the wheels (:data:`ROWS`), NaN where a sensor gave nothing; it may be late,
+A row holds what was measured at a tick of the wheels, NaN where a sensor gave nothing; it may be late,
 wrong or absent, and what comes out is never infinite.  A whole log (:func:`rows_of`, :func:`observe`), a run sample by
 sample (:class:`~terrain.estimation.live.LiveObserver`) and a simulated robot call the same step.
 
@@ -38,15 +38,23 @@ LONGEST_STEP_S = 1.0
 """A longer time since the step before is no step: a robot may have done anything."""
 
 
-ROWS: tuple[str, ...] = (
-    *("speed_left_mps", "speed_right_mps", "speed_rear_mps", "steer_front_rad"),
-    *("position_x_m", "position_y_m", "yaw_rad"),
-    *("yaw_rate_radps", "roll_rad", "pitch_rad", "accel_y_mps2"),
-)
-"""Circumferential speeds of the tracks, and of a car's rear axle; its steering angle; position and heading of
-the body's origin in a fixed right-handed frame, from poses, or satellites and a compass, brought to the time
-of the tick; yaw rate of the gyro; roll (left side up positive) and pitch (nose up negative); specific force
-to the left."""
+INERTIAL_ROWS = ("yaw_rate_radps", "roll_rad", "pitch_rad", "accel_y_mps2", "accel_x_mps2")
+"""Yaw rate of the gyro; roll (left side up positive) and pitch (nose up negative); specific force to the left and
+ahead."""
+
+PLACE_ROWS = ("position_x_m", "position_y_m", "yaw_rad")
+"""Position and heading of the body's origin in a fixed right-handed frame, from poses, or satellites and a compass,
+brought to the time of the tick."""
+
+FIX_ROWS: Mapping[str, tuple[str, ...]] = {
+    "gnss": ("gnss_x_m", "gnss_y_m", "gnss_std_m", "gnss_speed_x_mps", "gnss_speed_y_mps"),
+    "pose": ("pose_x_m", "pose_y_m", "pose_yaw_rad"),
+    "compass": ("compass_rad",),
+    "camera": ("camera_x_mps", "camera_y_mps"),
+}
+"""What sensors of the motion over ground measured as they did, each with ``<sensor>_age_s``, the time from the stamp to
+the tick: the antenna's position, its standard deviation and velocity in the world, a pose, a compass, and the body's
+velocity by a camera or a lidar."""
 
 HELD_S = 0.1
 """How long the last sample of IMU and steering stands for one that is missing: ten of an IMU's."""
@@ -63,14 +71,25 @@ INACCURATE_M = 0.2
 CLOCK_SET_SAMPLES = 10
 """So many samples in a row, a second behind the newest, are of a clock that was set back."""
 
+FIX_STD_M, FLOAT_STD_M = 0.02, 0.5
+"""Of a position whose standard deviation is not given: with a fix (RTK), and without one, or where that is not known."""
+
 CHANNELS: Mapping[str, tuple[str, ...]] = {
     "steering": ("angle_front_rad",),
-    "imu": ("gyro_z_radps", "roll_rad", "pitch_rad", "accel_y_mps2"),
+    "imu": ("gyro_z_radps", "roll_rad", "pitch_rad", "accel_y_mps2", "accel_x_mps2"),
     "pose": ("position_x_m", "position_y_m", "yaw_rad"),
-    "gnss": ("position_x_m", "position_y_m", "std_position_m"),
+    "gnss": (
+        *("position_x_m", "position_y_m", "std_position_m"),
+        *("velocity_x_mps", "velocity_y_mps", "fix_ratio"),
+    ),
     "compass": ("yaw_rad",),
+    "odometry": ("speed_x_mps", "speed_y_mps"),
+    "lidar": ("speed_x_mps", "speed_y_mps"),
 }
 """Channels that are read of each stream beside the wheels; those that a log lacks are unknown."""
+
+STREAM_OF_FIX = {"gnss": ("gnss",), "pose": ("pose",), "compass": ("compass",), "camera": ("odometry", "lidar")}
+"""Streams of each sensor of :data:`FIX_ROWS`; the first that is measured counts, and no lidar beside its own poses."""
 
 
 class ObserverStatus(StatusCode):
@@ -228,11 +247,21 @@ class ObserverFeed(_WithMemory):
     ) -> None:
         self._robot, self._terms, wheels = robot, tuple(terms), channels.get("wheels", ())
         check_channels("wheels", robot.rate_channels, wheels)
-        self._speeds, self._rows = {name: wheels.index(name) for name in robot.rate_channels}, rows
+        names = map("speed_{}_mps".format, robot.logged_wheels)
+        self._speeds = {name: wheels.index(rate) for name, rate in zip(names, robot.rate_channels, strict=True)}
+        self._mps_per_rate = robot.wheel_radius_m / robot.completed.motors.reduction_ratio if robot.by_motor else 1.0
+        self._rows, self._takes_place = rows, "position_x_m" in rows
+        self._fixes: dict[str, str] = {}
+        for sensor, streams in STREAM_OF_FIX.items():
+            measured = [stream for stream in streams if channels.get(stream)]
+            if FIX_ROWS[sensor][0] in rows and measured and not ("lidar" in measured and "pose" in self._fixes):
+                self._fixes[sensor] = measured[0]
+        read = {"steering", "imu", *self._fixes.values()}
+        read |= {"pose", "gnss", "compass"} if self._takes_place else set()
         self.queues = {
             stream: SampleQueue(places_among(names, channels[stream]))
             for stream, names in CHANNELS.items()
-            if channels.get(stream)
+            if channels.get(stream) and stream in read
         }
         self.dropped: Counter[str] = Counter()
         self.begin()
@@ -264,9 +293,9 @@ class ObserverFeed(_WithMemory):
             if not samples and self.queues[name].n_behind >= CLOCK_SET_SAMPLES:  # its own clock was set back
                 self.dropped["time: clock set"] += 1
                 self.queues[name].taken_s, self.queues[name].n_behind = -math.inf, 0
-        row = dict.fromkeys(ROWS, math.nan)
-        speeds = {name: float(wheels[column]) for name, column in self._speeds.items()}
-        row |= speeds | dict(zip(ROWS[7:], self._means("imu", time_s, due), strict=True))
+        row = dict.fromkeys(self._rows, math.nan)
+        speeds = {name: float(wheels[column]) * self._mps_per_rate for name, column in self._speeds.items()}
+        row |= speeds | dict(zip(INERTIAL_ROWS, self._means("imu", time_s, due), strict=True))
         (row["steer_front_rad"],) = self._means("steering", time_s, due, last=True)
         if self._terms and isinstance(self._robot, BicycleRobot):
             # what is remembered before a tick may be gone back to
@@ -275,7 +304,11 @@ class ObserverFeed(_WithMemory):
             row[name], row["steer_front_rad"] = rolling_axle(
                 self._robot, self._terms, speed, angle, step_s, self._lags
             )
-        row |= zip(ROWS[4:7], self._fix(time_s, sum(speeds.values()) / len(speeds), due), strict=True)
+        if self._takes_place:
+            mean_mps = sum(speeds.values()) / len(speeds)
+            row |= zip(PLACE_ROWS, self._fix(time_s, mean_mps, due), strict=True)
+        for sensor, stream in self._fixes.items():
+            row |= self._measured(sensor, stream, time_s, due)
         return np.array([row[name] for name in self._rows])
 
     def _means(self, stream: str, time_s: float, due: Mapping[str, Due], last: bool = False) -> list[float]:
@@ -291,6 +324,19 @@ class ObserverFeed(_WithMemory):
             else:
                 means.append(value if time_s - stamp_s <= HELD_S else math.nan)
         return means
+
+    def _measured(self, sensor: str, stream: str, time_s: float, due: Mapping[str, Due]) -> dict[str, float]:
+        """Return the last sample since the tick before of which anything is known, as it was measured, and its age."""
+        for stamp_s, _, values in reversed(due.get(stream, ())):
+            sample = values.tolist()
+            if time_s - stamp_s > LATE_S:
+                self.dropped[f"{stream}: late"] += 1
+            elif not all(map(math.isnan, sample[:2])) or (sensor == "gnss" and not math.isnan(sample[3])):
+                if sensor == "gnss" and not sample[2] > 0.0:
+                    sample[2] = FIX_STD_M if sample[5] >= 0.5 else FLOAT_STD_M
+                found = dict(zip(FIX_ROWS[sensor], sample, strict=False))
+                return found | {f"{sensor}_age_s": time_s - stamp_s}
+        return {}
 
     def _known(self, stream: str, time_s: float, due: Mapping[str, Due]) -> tuple[float, list[float]] | None:
         """Return the last sample since the tick before that is known, accurate and not late; None without."""

@@ -1,0 +1,514 @@
+r"""Slip of a robot of any drive, from whatever measures its motion: satellites, poses, a camera or nothing at all.
+
+The body moves with V = (v_x, v_y, w) at its origin, heading psi.  Row i of the wheels, with the direction and place of a
+wheel in :math:`D_i` (:func:`terrain.kinematics.wheels.rolling_matrix`), its circumferential speed :math:`u_i` and the root
+mean square U of all of them, is
+
+.. math:: D_i V = u_i (1 - m_i) - \chi\, t_i - d_i U .
+
+- **m**, the slip of this ground, of each side of a robot that skids, else of all wheels: a random walk while the robot
+  moves, the same forward and backward, and through standstill.
+- **chi**, what is lost in turning.  Robots that skid: :math:`t = \mp (u_r - u_l) / 2` left and right, so that straight
+  motion does not show it and the effective track is :math:`B / (1 - \chi)` (Mandow et al., Experimental kinematics for
+  wheeled skid-steer mobile robots, IROS 2007).  Robots that steer: a row across the front wheel, which does not slide,
+  with :math:`t = u \sin \delta`, so that chi is what understeer takes of the curvature.
+- **d**, what slip deviates by for moments, as traction and turning change: forgotten within :data:`FAST_S`, with a
+  deviation that grows with the acceleration of the wheels and how tight the turn is.
+
+So slip is linear in V, m, chi and d at every speed, singular nowhere, and a wheel that stands says that the ground
+stands below it, and nothing of its slip.  The slip ratio that comes out is that of its definition, of :math:`u_i` and
+:math:`D_i V` (:mod:`terrain.slip`).
+
+The speed ahead follows the accelerometer where there is one, without gravity by the measured pitch, with a bias that
+walks; sideways speed of robots that cannot drive sideways returns to 0.  A gyro measures w and its bias.
+
+**Ages.**  A fix is of an instant before its tick.  It is not moved to it: what the filter expects of it is that of its
+own instant, by its state, so that a receiver that is late leaves no error in the speed to first order.
+
+**Heading.**  Without pose or compass the heading follows from the motion.  Until it is known the filter runs in a frame
+that begins at 0; the angle between the travel by wheels and gyro and that of the receiver, and its deviation, then turn
+it to the receiver's frame: fixes are used from there on.  Driving backward is no exception.
+
+**What is not observed.**  Slip is NaN before the first reference of the speed over ground, and where its standard
+deviation passes :data:`UNKNOWN_RATIO`: then nothing is known of it.  Without a reference m walks on, so that slip of the
+ground is remembered through standstill and over seconds without one, with a deviation that grows.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.angles import wrapped
+from terrain.constants import GRAVITY_MPS2
+from terrain.estimation.filter import (
+    GATE_PROBABILITY,
+    REOPEN_AFTER_S,
+    FilterModel,
+    FilterSettings,
+    differentiate,
+)
+from terrain.estimation.models.observer import FilterObserver, ObserverOutput, ObserverStatus
+from terrain.estimation.wheel_slip import wheel_speed_scatter_mps
+from terrain.kernels import njit
+from terrain.kinematics.wheels import STEEPEST_RAD, rolling_matrix
+from terrain.records import Array
+from terrain.robots import BicycleRobot, Robot
+from terrain.slip import MIN_SPEED_MPS, slip_ratio
+
+FAST_S, ACROSS_S = 0.5, 1.0
+"""Over which d, and sideways speed of a robot that cannot drive sideways, are forgotten."""
+FAST_RATIO, FAST_PER_MPS2, FAST_TURNING = 0.01, 0.12, 0.06
+"""Standard deviation of d in steady straight motion; what an acceleration of the wheels of 1 m/s^2, a tenth of the
+weight in traction, adds; and what turning on the spot does."""
+SLOW_RATIO, SLOW_WALK = 0.2, 0.012
+"""Of m at first, about 0, and its walk within a second of driving."""
+TURN_WALK = 0.02
+"""Walk of chi within a second of turning."""
+ACROSS_RATIO, ACROSS_M = 0.01, 0.05
+"""Sideways speed over the speed of the wheels, and over the yaw rate: of a robot that skids, and in turns."""
+WHEEL_STD_MPS, GYRO_STD_RADPS, YAW_ACCEL = 0.01, 0.005, 1.0
+"""Of a wheel's speed and a gyro's rate; walk of the yaw rate within a second."""
+BIAS_STD_RADPS, BIAS_WALK = 0.005, 2e-4
+ACCEL_WALK, SHAKEN_RATIO, FREE_WALK = 0.05, 0.1, 1.0
+"""Walk of the speed within a second beside an accelerometer, what 1 m/s^2 of vibration adds, and without one."""
+TILTED_STD, TILTED_WALK, UNTILTED_STD, UNTILTED_WALK = 0.15, 0.02, 0.6, 0.3
+"""Of the accelerometer's bias with a measured pitch, and without one, where it is the slope's gravity."""
+POSE_STD_M, POSE_STD_RAD, COMPASS_STD_RAD, CAMERA_STD_MPS, GNSS_SPEED_STD_MPS = 0.02, 0.02, 0.05, 0.03, 0.03
+"""Of measurements whose own deviation is not given."""
+DELAY_S, DELAY_STD_S = 0.05, 0.05
+"""Of fixes behind their stamps, at first: some are stamped when they are measured, some when they arrive."""
+ALIGNED_RAD, CRAB_RAD, LOST_RAD = 0.05, 0.05, 0.6
+"""Deviation at which a heading by the motion is used; that of the motion from the heading; and one that is lost."""
+LEAST_TRAVEL_M, LEAST_RATIO = 0.5, 0.3
+"""Travel by the wheels that shows a heading, and how much of it the receiver has to see."""
+PREDICTED_S = 0.5
+"""Time without a reference from which on slip is predicted."""
+UNKNOWN_RATIO = 0.25
+"""Standard deviation of a slip that is not known."""
+LEAST_MPS, STANDING_MPS, VIBRATION_S, CHANGE_S = 0.2, 0.01, 0.3, 0.15
+"""Least speed that shows a heading, that of wheels that stand; low-passes of vibration and of the wheels' speeds."""
+N_JUDGED = 7
+"""Sensors beside the wheels, which are rejected where the ground or a sensor is to blame."""
+MOST_MPS, MOST_RADPS, MOST_MPS2 = 60.0, 30.0, 100.0
+"""More than wheels, gyro and accelerometer of a ground robot measure."""
+
+_MOTION = (
+    *("position_x_m", "position_y_m", "yaw_rad", "speed_x_mps", "speed_y_mps", "yaw_rate_radps"),
+    *("gyro_bias_radps", "accel_bias_x_mps2", "fix_delay_s"),
+)
+_X, _Y, _YAW, _VX, _VY, _W, _GYRO_BIAS, _ACCEL_BIAS, _DELAY, _SLOW = range(10)
+MOST_ROWS = 4
+# Places in `params`: counts and levers, the slow state of each row; and as inputs D, u, t, U, the acceleration, ages.
+_N_ROWS, _N_SLOW, _TURNS, _FREE_ACROSS, _ANTENNA, _POSED, _SEEN, _GROUP = 0, 1, 2, 3, 4, 6, 8, 10
+_D, _U, _T, _SIZE, _ACCEL, _AGES = 14, 26, 30, 34, 35, 36
+_N_AGES = 22  # place of the ages among the inputs
+_INPUTS = (
+    *(f"d_{i}" for i in range(3 * MOST_ROWS)),
+    *(f"{name}_{i}" for name in "ut" for i in range(MOST_ROWS)),
+    *("size", "accel", "gnss_age", "pose_age", "camera_age"),
+)
+
+_REFERENCES = (
+    *("gnss_x_m", "gnss_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps"),
+    *("pose_x_m", "pose_y_m", "pose_yaw_rad", "compass_rad", "camera_x_mps", "camera_y_mps"),
+)
+_AGE_ROWS = ("gnss_age_s", "pose_age_s", "camera_age_s")
+_INERTIAL = ("yaw_rate_radps", "accel_x_mps2", "pitch_rad")
+
+
+@njit
+def _move(x: Array, dt: float, params: Array, x_next: Array) -> None:
+    accel = params[_ACCEL] - x[_ACCEL_BIAS] if math.isfinite(params[_ACCEL]) else 0.0
+    middle = x[_YAW] + 0.5 * dt * x[_W]
+    cos, sin = math.cos(middle), math.sin(middle)
+    along, across = x[_VX] + 0.5 * dt * accel, x[_VY]
+    x_next[:] = x
+    x_next[_X] += dt * (along * cos - across * sin)
+    x_next[_Y] += dt * (along * sin + across * cos)
+    x_next[_YAW] += dt * x[_W]
+    x_next[_VX] += dt * (accel + x[_W] * across)
+    if params[_FREE_ACROSS] == 0.0:
+        x_next[_VY] *= math.exp(-dt / ACROSS_S)
+    else:
+        x_next[_VY] -= dt * x[_W] * x[_VX]
+    fast = _SLOW + int(params[_N_SLOW] + params[_TURNS])
+    for i in range(int(params[_N_ROWS])):
+        x_next[fast + i] *= math.exp(-dt / FAST_S)
+
+
+@njit
+def _propagate(x: Array, dt: float, params: Array, x_next: Array, f: Array) -> None:
+    differentiate(_move, x, dt, params, x_next, f)
+
+
+@njit
+def _wheels(x: Array, params: Array, z: Array) -> None:
+    n_slow, turns = int(params[_N_SLOW]), int(params[_TURNS])
+    for i in range(int(params[_N_ROWS])):
+        d = _D + 3 * i
+        ground = params[d] * x[_VX] + params[d + 1] * x[_VY] + params[d + 2] * x[_W]
+        z[i] = ground - params[_U + i] * (1.0 - x[_SLOW + int(params[_GROUP + i])])
+        if turns > 0:
+            z[i] += params[_T + i] * x[_SLOW + n_slow]
+        z[i] += params[_SIZE] * x[_SLOW + n_slow + turns + i]
+
+
+@njit
+def _placed(x: Array, age: float, lever_x: float, lever_y: float, params: Array, z: Array) -> None:
+    """Write position and velocity in the world of a point of the body, an age ago."""
+    accel = params[_ACCEL] - x[_ACCEL_BIAS] if math.isfinite(params[_ACCEL]) else 0.0
+    along, across = x[_VX] - age * (accel + x[_W] * x[_VY]), x[_VY]
+    middle, then = x[_YAW] - 0.5 * age * x[_W], x[_YAW] - age * x[_W]
+    mean = 0.5 * (along + x[_VX])
+    z[0] = x[_X] - age * (mean * math.cos(middle) - across * math.sin(middle))
+    z[1] = x[_Y] - age * (mean * math.sin(middle) + across * math.cos(middle))
+    cos, sin = math.cos(then), math.sin(then)
+    z[0] += cos * lever_x - sin * lever_y
+    z[1] += sin * lever_x + cos * lever_y
+    ahead, left = along - x[_W] * lever_y, across + x[_W] * lever_x
+    z[2], z[3] = cos * ahead - sin * left, sin * ahead + cos * left
+
+
+@njit
+def _measure(x: Array, _dt: float, params: Array, z: Array) -> None:
+    z[:] = 0.0
+    _wheels(x, params, z)
+    z[4] = x[_W] + x[_GYRO_BIAS]
+    _placed(x, params[_AGES] + x[_DELAY], params[_ANTENNA], params[_ANTENNA + 1], params, z[5:9])
+    pose = np.zeros(4)
+    age = params[_AGES + 1] + x[_DELAY]
+    _placed(x, age, params[_POSED], params[_POSED + 1], params, pose)
+    z[9], z[10], z[11] = pose[0], pose[1], x[_YAW] - age * x[_W]
+    z[12] = x[_YAW]
+    z[13] = x[_VX] - x[_W] * params[_SEEN + 1]
+    z[14] = x[_VY] + x[_W] * params[_SEEN]
+    if math.isfinite(params[_ACCEL]):
+        z[13] -= (params[_AGES + 2] + x[_DELAY]) * (params[_ACCEL] - x[_ACCEL_BIAS])
+
+
+@njit
+def _observe(x: Array, params: Array, z_hat: Array, h: Array) -> None:
+    differentiate(_measure, x, 0.0, params, z_hat, h)
+
+
+@njit
+def _speed_below(x: Array, _dt: float, params: Array, y: Array) -> None:
+    for i in range(MOST_ROWS):
+        d = _D + 3 * i
+        y[i] = params[d] * x[_VX] + params[d + 1] * x[_VY] + params[d + 2] * x[_W]
+
+
+@njit
+def _ground(x: Array, params: Array) -> tuple[Array, Array]:
+    y, by_x = np.empty(MOST_ROWS), np.empty((MOST_ROWS, x.size))
+    differentiate(_speed_below, x, 0.0, params, y, by_x)
+    return y, by_x
+
+
+class WheelRows(NamedTuple):
+    """Rows of the wheels of a robot that are constant: which wheel, and in which slow state its slip is."""
+
+    logged: Array  #: (n,) place of each logged wheel among the robot's
+    groups: tuple[int, ...]  #: slow state of each row
+    n_slow: int
+
+
+def rows_of_wheels(robot: Robot) -> WheelRows:
+    """Return the rows of a robot's wheels: one of each that is logged, and one across a steered front wheel."""
+    logged = np.flatnonzero(np.isin(robot.wheels, robot.logged_wheels))
+    n = len(logged) + isinstance(robot, BicycleRobot)
+    groups = tuple(range(n)) if robot.skids else (0,) * n
+    return WheelRows(logged, groups, 2 if robot.skids else 1)
+
+
+class SlipFilter(FilterObserver):
+    """The slip of a robot of any drive that is not a swerve robot.
+
+    Parameters
+    ----------
+    robot : skid-steer, tracked, omni, mecanum, car-like or a tricycle
+
+    Examples
+    --------
+    >>> from terrain.estimation.models.observer import observe
+    >>> from terrain.robots import load_robot
+    >>> filter_, time_s = SlipFilter(load_robot("husky")), np.arange(0.0, 20.0, 0.1)
+    >>> rows = np.full((len(time_s), len(filter_.rows)), np.nan)
+    >>> rows[:, [filter_.rows.index(name) for name in ("speed_left_mps", "speed_right_mps")]] = 1.0
+    >>> rows[:, filter_.rows.index("gnss_x_m")] = 0.9 * time_s
+    >>> rows[:, filter_.rows.index("gnss_y_m")] = rows[:, filter_.rows.index("gnss_age_s")] = 0.0
+    >>> track = observe(filter_, time_s, rows)
+    >>> track.slip[-1].round(2), track.slip_std[-1].round(2)
+    (array([0.1, 0.1]), array([0.02, 0.02]))
+    """
+
+    in_world = True
+    name = "slip"
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot, self._wheels = robot, rows_of_wheels(robot)
+        logged, groups, n_slow = self._wheels
+        n_rows, turns = len(groups), robot.skids or isinstance(robot, BicycleRobot)
+        names = [robot.wheels[i] for i in logged.tolist()]
+        slow = [f"ground_slip_{name}_ratio" for name in names] if robot.skids else ["ground_slip_ratio"]
+        self.states = (*_MOTION, *slow, *["turn_loss_ratio"] * turns)
+        self.slips = tuple(f"slip_{name}_ratio" for name in names)
+        self._speeds = tuple(f"speed_{name}_mps" for name in names)
+        steer = ("steer_front_rad",) * robot.steered
+        self.rows = (*self._speeds, *steer, *_INERTIAL, *_REFERENCES, *_AGE_ROWS, "gnss_std_m")
+        self._scatter_mps = float(np.fmax(wheel_speed_scatter_mps(robot), WHEEL_STD_MPS))
+        effective_m = robot.identified.get("effective_track_m")
+        loss, loss_std = (0.4, 0.25) if robot.skids else (0.0, 0.15)
+        if robot.skids and effective_m is not None:
+            loss, loss_std = 1.0 - robot.track_m / max(effective_m, robot.track_m), 0.1
+        wheel_rows = tuple(f"wheel_{i}_mps" for i in range(MOST_ROWS))
+        levers = *_lever(robot, "antenna"), *_identified(robot, "pose_x_m", "pose_y_m"), *_lever(robot, "camera")
+        counts = n_rows, n_slow, turns, robot.on_omni_wheels
+        model = FilterModel(
+            name=self.name,
+            states=(*self.states, *(f"passing_slip_{i}_ratio" for i in range(n_rows))),
+            rows=(*wheel_rows, "gyro_z_radps", *_REFERENCES),
+            sensors=(
+                ("gyro", ("gyro_z_radps",)),
+                ("pose_yaw", _REFERENCES[6:7]),
+                ("compass", _REFERENCES[7:8]),
+                ("pose", _REFERENCES[4:6]),
+                ("gnss_position", _REFERENCES[:2]),
+                ("gnss_speed", _REFERENCES[2:4]),
+                ("camera", _REFERENCES[8:]),
+                *((name, (name,)) for name in wheel_rows),
+            ),
+            propagate=_propagate,
+            observe=_observe,
+            params=np.array([*counts, *levers, *groups, *[0] * (MOST_ROWS - n_rows)], dtype=float),
+            process_variance=np.zeros(len(self.states) + n_rows),
+            measurement_variance=np.ones(MOST_ROWS + 1 + len(_REFERENCES)),
+            initial_variance=np.square(
+                [1e-3, 1e-3, 1e-3, 1.0, 0.1, 0.5, BIAS_STD_RADPS, UNTILTED_STD, DELAY_STD_S]
+                + [SLOW_RATIO] * n_slow
+                + [loss_std] * turns
+                + [FAST_RATIO] * n_rows
+            ),
+            initial_mean=np.array([0.0] * _DELAY + [DELAY_S] + [0.0] * n_slow + [loss] * turns + [0.0] * n_rows),
+            inputs=_INPUTS,
+            references=("pose", "gnss_position", "gnss_speed", "camera"),
+            positions=_MOTION[:2],
+            angle_states=("yaw_rad",),
+            angle_rows=("pose_yaw_rad", "compass_rad"),
+        )
+        super().__init__(model, FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S))
+        place = robot.wheel_positions_m, robot.wheel_directions_rad, robot.roller_angles_rad
+        self._rolling = rolling_matrix(*place)[logged]
+        self._smooth_mps, self._accel_mps2, self._shaken_square = np.full(len(logged), np.nan), math.nan, 0.0
+        self._is_placed, self._first, self._seen, self._weight = False, np.full(2, np.nan, complex), 0j, 0.0
+        self._known = np.full(len(logged), np.nan)
+
+    def step(self, row: Array, dt_s: float) -> ObserverOutput:
+        """Take a row of :attr:`rows`; the frame begins at the first pose, or where the heading becomes known."""
+        given = dict(zip(self.rows, row.tolist(), strict=True))
+        dt_s = dt_s if 0.0 <= dt_s < math.inf else 0.0
+        speeds = np.array([given[name] for name in self._speeds])
+        speeds[~(np.abs(speeds) <= MOST_MPS)] = np.nan
+        rates_mps2 = self._rates(speeds, dt_s)
+        inputs = self._inputs(given, speeds, dt_s)
+        z = np.full(MOST_ROWS, np.nan)
+        z[: speeds.size] = 0.0 * speeds
+        if len(self._wheels.groups) > speeds.size and math.isfinite(given["steer_front_rad"]):
+            z[speeds.size] = z[0]
+        gyro = given["yaw_rate_radps"]
+        references = self._place(given, inputs)
+        z = np.concatenate([z, [gyro if abs(gyro) <= MOST_RADPS else np.nan], references])
+        variance = self._variance(given, rates_mps2, dt_s)
+        fix = self.advance(dt_s, z, inputs, self._walk(given, inputs, rates_mps2, dt_s), variance, N_JUDGED)
+        if self._is_placed and self.filter.cov[_YAW, _YAW] > LOST_RAD**2:
+            self._is_placed, self._first[:] = False, np.nan
+        return self._output(speeds, inputs, fix)
+
+    def _rates(self, speeds: Array, dt_s: float) -> Array:
+        """Return how fast the speeds of the wheels change, behind a low-pass; 0 where that is not known."""
+        behind = np.nan_to_num(speeds - self._smooth_mps)
+        gain = -math.expm1(-dt_s / CHANGE_S)
+        moved = np.where(np.isfinite(self._smooth_mps), self._smooth_mps + gain * behind, speeds)
+        self._smooth_mps = np.where(np.isfinite(speeds), moved, self._smooth_mps)
+        return behind / CHANGE_S
+
+    def _inputs(self, given: Mapping[str, float], speeds: Array, dt_s: float) -> Array:
+        """Return the inputs of a tick; a steered wheel's direction is that of its angle."""
+        n, inputs = speeds.size, np.zeros(len(_INPUTS))
+        known = np.nan_to_num(speeds)
+        rolling = np.zeros((MOST_ROWS, 3))
+        rolling[:n], turning = self._rolling, np.zeros(MOST_ROWS)
+        if self._robot.skids:
+            turning[:2] = np.array([-0.5, 0.5]) * (known[1] - known[0])
+        elif isinstance(self._robot, BicycleRobot):
+            angle = given["steer_front_rad"]
+            angle = min(max(angle, -STEEPEST_RAD), STEEPEST_RAD) if math.isfinite(angle) else 0.0
+            cos, sin, base_m = math.cos(angle), math.sin(angle), self._robot.wheelbase_m
+            if self._robot.front_driven:
+                rolling[0] = cos, sin, sin * base_m
+            rolling[1], turning[1] = (-sin, cos, cos * base_m), sin * known[0]
+        accel = given["accel_x_mps2"]
+        if math.isfinite(given["pitch_rad"]):  # the specific force at rest is -g sin(pitch)
+            accel += GRAVITY_MPS2 * math.sin(given["pitch_rad"])
+        accel = accel if abs(accel) <= MOST_MPS2 else math.nan
+        if math.isfinite(accel):
+            if math.isnan(self._accel_mps2):
+                self._accel_mps2 = accel
+            gain, apart = -math.expm1(-dt_s / VIBRATION_S), accel - self._accel_mps2
+            self._accel_mps2 += gain * apart
+            self._shaken_square += gain * (apart * apart - self._shaken_square)
+        size = math.sqrt(float(np.mean(known**2)))
+        ages = [given[name] if math.isfinite(given[name]) else 0.0 for name in _AGE_ROWS]
+        inputs[:12], inputs[12 : 12 + n], inputs[16:20] = rolling.ravel(), known, turning
+        inputs[20:] = size, accel, *ages
+        return inputs
+
+    def _variance(self, given: Mapping[str, float], rates_mps2: Array, dt_s: float) -> Array:
+        """Return the variance of each measurement.
+
+        A wheel's speed is a mean over a tick, half of one late; a receiver's speed is late by its age where no
+        accelerometer measures what it has changed by.
+        """
+        std = np.full(MOST_ROWS + 1 + len(_REFERENCES), self._scatter_mps)
+        std[: rates_mps2.size] = np.hypot(self._scatter_mps, 0.29 * dt_s * rates_mps2)
+        late_mps = 0.0 if math.isfinite(given["accel_x_mps2"]) else given["gnss_age_s"] * FREE_WALK
+        fix_m = given["gnss_std_m"]
+        std[MOST_ROWS:] = (
+            *(GYRO_STD_RADPS, fix_m, fix_m, *[math.hypot(GNSS_SPEED_STD_MPS, late_mps)] * 2),
+            *(POSE_STD_M, POSE_STD_M, POSE_STD_RAD, COMPASS_STD_RAD, CAMERA_STD_MPS, CAMERA_STD_MPS),
+        )
+        return np.where(np.isfinite(std), std, GNSS_SPEED_STD_MPS) ** 2
+
+    def _walk(self, given: Mapping[str, float], inputs: Array, rates_mps2: Array, dt_s: float) -> Array:
+        """Return what the variance of each state grows by in a second, up to this tick."""
+        n_rows, n_slow, size = len(self._wheels.groups), self._wheels.n_slow, float(inputs[20])
+        dt_s, walk = max(dt_s, 1e-6), np.zeros(len(self.filter.model.states))
+        has_accel, has_pitch = math.isfinite(inputs[21]), math.isfinite(given["pitch_rad"])
+        shaken = SHAKEN_RATIO * math.sqrt(self._shaken_square)
+        walk[_VX] = (ACCEL_WALK + shaken if has_accel else FREE_WALK) ** 2
+        turn_radps = abs(float(self.filter.mean[_W]))
+        across = (ACROSS_RATIO * size + ACROSS_M * turn_radps) ** 2
+        walk[_VY] = FREE_WALK**2 if self._robot.on_omni_wheels else _fading(across, ACROSS_S, dt_s)
+        walk[_W], walk[_GYRO_BIAS] = YAW_ACCEL**2, BIAS_WALK**2
+        walk[_ACCEL_BIAS] = (TILTED_WALK if has_pitch else UNTILTED_WALK) ** 2
+        tight = float(np.abs(inputs[16:20]).max()) / size if size > STANDING_MPS else 0.0
+        if size > STANDING_MPS:
+            walk[_SLOW : _SLOW + n_slow] = SLOW_WALK**2
+            walk[_SLOW + n_slow : len(self.states)] = (TURN_WALK * tight) ** 2
+        fast = FAST_RATIO + FAST_PER_MPS2 * float(np.abs(rates_mps2).max()) + FAST_TURNING * tight
+        walk[-n_rows:] = _fading(fast**2, FAST_S, dt_s)
+        return walk
+
+    def _place(self, given: Mapping[str, float], inputs: Array) -> Array:
+        """Return the references that are used at a tick, and begin their frame where that becomes possible."""
+        z = np.array([given[name] for name in _REFERENCES])
+        if self._is_placed:
+            return z
+        mean, cov, params, ages_s = self.filter.mean, self.filter.cov, self.filter.model.params, inputs[_N_AGES:]
+        yaw, turn_radps = float(mean[_YAW]), float(mean[_W])
+        fix, pose = complex(z[0], z[1]), complex(z[4], z[5])
+        lever, age_s, std_m = complex(*params[_ANTENNA:_POSED]), float(ages_s[0]), given["gnss_std_m"]
+        place, turned, std = fix, math.nan, math.inf
+        if math.isfinite(z[6]) and not cmath.isnan(pose):
+            place, lever, age_s, std_m = pose, complex(*params[_POSED:_SEEN]), float(ages_s[1]), POSE_STD_M
+            turned, std = z[6] - yaw + age_s * turn_radps, POSE_STD_RAD
+        elif math.isfinite(z[7]) and not cmath.isnan(fix):
+            turned, std = z[7] - yaw, COMPASS_STD_RAD
+        forward = cmath.exp(1j * yaw)
+        velocity = complex(mean[_VX], mean[_VY]) * forward
+        if std == math.inf:
+            at = complex(mean[_X], mean[_Y]) - age_s * velocity + lever * forward
+            moving = velocity + 1j * turn_radps * lever * forward
+            turned, std = self._turned(fix, complex(z[2], z[3]), at, moving, std_m)
+        z[:8] = math.nan
+        if not std <= math.hypot(ALIGNED_RAD, CRAB_RAD):
+            return z
+        if not cmath.isnan(place):
+            rotated = cmath.exp(1j * turned)
+            origin = place + (age_s * velocity - lever * forward) * rotated
+            mean[_X], mean[_Y] = origin.real, origin.imag
+        cov[:3, :], cov[:, :3] = 0.0, 0.0
+        mean[_YAW], cov[_YAW, _YAW] = wrapped(yaw + turned), std**2
+        cov[_X, _X] = cov[_Y, _Y] = (std_m if std_m > 0.0 else POSE_STD_M) ** 2 + (abs(lever) * std) ** 2
+        self._is_placed = True
+        return z
+
+    def _turned(
+        self, fix: complex, speed: complex, at: complex, velocity: complex, fix_std_m: float
+    ) -> tuple[float, float]:
+        """Return the angle from the filter's own frame to the receiver's, and its deviation; infinite where unknown.
+
+        By the travel since the first fix, and by the receiver's speeds; ``at`` and ``velocity`` are those of the antenna
+        in the filter's own frame.  A wheel that spins shows no heading: the receiver has to move as well.
+        """
+        angle, std = math.nan, math.inf
+        if not cmath.isnan(speed) and min(abs(speed), abs(velocity)) >= LEAST_MPS:
+            self._seen += speed * velocity.conjugate()
+            self._weight += abs(speed) ** 2
+            angle, std = cmath.phase(self._seen), GNSS_SPEED_STD_MPS / math.sqrt(self._weight)
+        if not cmath.isnan(fix):
+            if np.isnan(self._first[0]):
+                self._first[:] = fix, at
+            seen, travelled = fix - complex(self._first[0]), at - complex(self._first[1])
+            scatter_m = math.sqrt(2.0) * fix_std_m
+            if abs(travelled) >= LEAST_TRAVEL_M and abs(seen) >= LEAST_RATIO * abs(travelled):
+                if scatter_m / abs(seen) < std:
+                    angle, std = cmath.phase(seen * travelled.conjugate()), scatter_m / abs(seen)
+        return angle, math.hypot(std, CRAB_RAD)
+
+    def _output(self, speeds: Array, inputs: Array, fix: ObserverStatus) -> ObserverOutput:
+        """Return states and slip ratios of the wheels, NaN where they are not observed."""
+        ground, std = self.read(_ground, inputs)
+        n, age_s, mean = speeds.size, self.filter.reference_age_s, self.filter.mean
+        slip = slip_ratio(speeds, ground[:n])
+        fastest = np.fmax(np.abs(speeds), np.abs(ground[:n]))
+        # by the speed over ground, and by that of the wheel, in traction and in braking
+        slower = np.fmin(np.abs(speeds), np.abs(ground[:n])) / np.fmax(fastest, MIN_SPEED_MPS)
+        traction = np.abs(speeds) >= np.abs(ground[:n])
+        by_ground, by_wheel = np.where(traction, 1.0, slower), np.where(traction, slower, 1.0)
+        deviation = np.hypot(by_ground * std[:n], by_wheel * self._scatter_mps) / np.fmax(fastest, MIN_SPEED_MPS)
+        unknown = np.isnan(slip) | (deviation > UNKNOWN_RATIO) | (age_s == math.inf)
+        slip[unknown] = deviation[unknown] = math.nan
+        d = len(self.states)
+        status = fix
+        if age_s == math.inf:
+            status = ObserverStatus.STARTING
+        elif not np.isfinite(speeds).any():
+            status = ObserverStatus.BAD_INPUT
+        elif fix is ObserverStatus.OK and float(inputs[20]) < STANDING_MPS:
+            status = ObserverStatus.STANDING
+        elif fix is ObserverStatus.OK and age_s > PREDICTED_S:
+            status = ObserverStatus.PREDICTED
+        self.reason = self._reason(age_s, deviation)
+        std = np.sqrt(np.maximum(self.filter.cov.diagonal()[:d], 0.0))
+        return ObserverOutput(mean[:d].copy(), std, slip, deviation, int(status))
+
+    def _reason(self, age_s: float, deviation: Array) -> str:
+        """Return why slip is unknown, in a sentence; empty where it is known or the robot stands."""
+        if age_s == math.inf and (self._weight > 0.0 or not np.isnan(self._first[0])):
+            return f"the heading is not known yet: it follows from a motion of {LEAST_TRAVEL_M:g} m with fixes"
+        if age_s == math.inf:
+            return "nothing has measured the speed over ground: no fix, pose or camera"
+        if age_s > PREDICTED_S and np.isnan(deviation).all():
+            return f"the speed over ground was last measured {age_s:.0f} s ago"
+        return ""
+
+
+def _fading(variance: float, time_s: float, dt_s: float) -> float:
+    """Return what the variance of a state that fades within a time grows by in a second, so that it stays the same."""
+    return -variance * math.expm1(-2.0 * dt_s / time_s) / dt_s
+
+
+def _lever(robot: Robot, section: str) -> tuple[float, float]:
+    """Return where a sensor is mounted; the body's origin where the description does not say."""
+    part = robot.parts.get(section)
+    return (0.0, 0.0) if part is None else (part.lever_x_m, part.lever_y_m)  # type: ignore[union-attr]
+
+
+def _identified(robot: Robot, *names: str) -> tuple[float, ...]:
+    return tuple(robot.identified.get(name, 0.0) for name in names)
