@@ -31,7 +31,7 @@ from features.windows import (
 )
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.clocks import readable
-from terrain.estimation.live import Estimate, estimated_values
+from terrain.estimation.live import LiveEstimate, estimated_values
 from terrain.kinematics.logged_wheels import wheel_speeds_from
 from terrain.records import Array, Reading, Stream, Windows
 from terrain.robots import Robot
@@ -349,7 +349,7 @@ class WindowFeed:
         """No sample before this time can finish a window; minus infinity before all streams have begun."""
         return self._stream.due_s
 
-    def push(self, readings: Mapping[str, Reading], estimates: Sequence[Estimate] = ()) -> list[Windows]:
+    def push(self, readings: Mapping[str, Reading], estimates: Sequence[LiveEstimate] = ()) -> list[Windows]:
         """Take what was measured and estimated since the last call; return the windows it completes."""
         windows: list[Windows] = []
         push = self._stream.push

@@ -31,7 +31,7 @@ from terrain.control.switching import (
 from terrain.control.traction import TractionStatus
 from terrain.estimation.clocks import Clocks, ClockWatch
 from terrain.estimation.filter import Filter
-from terrain.estimation.live import BIASES, Estimate, Estimator
+from terrain.estimation.live import BIASES, Estimator, LiveEstimate
 from terrain.records import Command, Sample
 
 COMMAND_VALID_S = 0.25
@@ -112,7 +112,7 @@ class Chain:
     ) -> None:
         self.robot_name, self.switching, self._clocks = robot_name, switching, clocks
         self.belief: TerrainBelief = NO_BELIEF
-        self.estimate: Estimate | None = None
+        self.estimate: LiveEstimate | None = None
         check_table(table, robot_name)
         self.table = table
 
@@ -158,7 +158,7 @@ class Chain:
         self.source.swap(model)
         self.table = table
 
-    def _believe(self, sample: Sample, estimates: Sequence[Estimate]) -> OutputStatus:
+    def _believe(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> OutputStatus:
         """Update the belief by what the source finds in a sample; return what its last output was."""
         status, switching = OutputStatus.NONE, self.switching
         if self.source.settled:

@@ -21,7 +21,7 @@ from terrain.classify.terrain_filter import LiveTerrainFilter
 from terrain.control.switching import UNKNOWN, TerrainEstimate, TerrainSource
 from terrain.errors import DataError
 from terrain.estimation.clocks import last_stamp_s
-from terrain.estimation.live import CHANNELS, Estimate
+from terrain.estimation.live import CHANNELS, LiveEstimate
 from terrain.extension import correct_live
 from terrain.records import Array, Reading, Sample, Windows
 from terrain.robots import Robot
@@ -145,7 +145,7 @@ class Classifier(TerrainSource):
         self.failed: Counter[str] = Counter()
         self._channels, self._filter_name, self._thread = channels, filter_name, thread
         self._robot = None if robot is None else correct_live(robot)[0]
-        self._waiting: deque[tuple[Mapping[str, Reading], Sequence[Estimate]] | _Part] = deque()
+        self._waiting: deque[tuple[Mapping[str, Reading], Sequence[LiveEstimate]] | _Part] = deque()
         self._finished: deque[WindowOutput] = deque()
         self._part: _Part | None = None  # that is worked with
         self._over_time: LiveTerrainFilter | None = None
@@ -224,7 +224,7 @@ class Classifier(TerrainSource):
         except Exception as error:  # of one window: the next are served
             self._lost[f"window: lost to a fault, {type(error).__name__}"] += 1
 
-    def take(self, readings: Mapping[str, Reading], estimates: Sequence[Estimate]) -> list[WindowOutput]:
+    def take(self, readings: Mapping[str, Reading], estimates: Sequence[LiveEstimate]) -> list[WindowOutput]:
         """Take readings and estimates; return the outputs of windows that are there by now."""
         if self.model is None:
             return []
@@ -265,7 +265,7 @@ class Classifier(TerrainSource):
                 self._due_s = due_s if math.isfinite(due_s) else math.inf
                 self._counts = self._part.feed.dropped
 
-    def update(self, sample: Sample, estimates: Sequence[Estimate]) -> list[TerrainEstimate]:
+    def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
         """Return the terrain at the end of each window whose output is there by now."""
         found = []
         for output in self.take(sample.readings, estimates):

@@ -17,7 +17,7 @@ from pipelines.live.windows import live_estimator
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import SWITCHING, SwitchSettings, TerrainBelief, check_switching, drive_on
 from terrain.estimation.clocks import ClockWatch, last_stamp_s
-from terrain.estimation.live import Estimate
+from terrain.estimation.live import LiveEstimate
 from terrain.kinematics.logged_wheels import speed_columns
 from terrain.records import Reading, Sample
 from terrain.robots import Robot
@@ -115,7 +115,7 @@ class Observer(Chain):
             self._takes_names = False
             if named := getattr(samples, "channels", None):
                 self._set_up(self.model, named)
-        estimates: Sequence[Estimate] = ()
+        estimates: Sequence[LiveEstimate] = ()
         if self._filter is not None:
             estimates = self._filter.step(samples)
             self.estimate = self._filter.latest

@@ -29,7 +29,6 @@ from terrain.control.slip_table import SlipTable
 from terrain.discrepancy.watch import FALSE_ALARM_H, Watch, Watched
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.clocks import Inbox, SessionClock, numbers
-from terrain.estimation.live import LiveEstimate
 from terrain.records import Sample
 from terrain.robots import Robot
 
@@ -46,6 +45,8 @@ _NO_TWIST = np.zeros(3)
 MOTION = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
 SEEN = ("slip_ratio", "slip_std", "wheel_speed_mps", "current_a", *MOTION)
 """What an observation has of the estimate of a motion."""
+
+NOT_ESTIMATED = "no filter runs: the model of the terrain takes none, and no robot is described or driven"
 
 WINDOW = (
     *("start_s", "end_s", "terrain", "probabilities", "refused", "nearest", "novelty", "supported"),
@@ -344,15 +345,14 @@ class RobotSession:
     def _observation(self, time_s: float) -> dict[str, Any]:
         belief, seen = self.chain.belief, self.chain.estimate
         target = self.served.table.lookup(belief.terrain)
-        if isinstance(seen, LiveEstimate):
+        if seen is not None:
             known = {name: getattr(seen, name) for name in SEEN}
         else:
-            known = dict.fromkeys(SEEN[:2], np.full(len(self._wheels), math.nan))
+            known = dict.fromkeys(SEEN[:2], np.full(len(self._wheels), math.nan)) | dict.fromkeys(
+                MOTION, math.nan
+            )
             for name, channel in (("wheel_speed_mps", "speed_{}_mps"), ("current_a", "current_{}_a")):
                 known[name] = self.inbox.last("wheels", [channel.format(wheel) for wheel in self._wheels])
-            known |= dict.fromkeys(MOTION, math.nan)
-            if seen is not None and len(seen.slip) == len(self._wheels):
-                known |= {"slip_ratio": seen.slip, "slip_std": seen.slip_std}
         sensors = self.chain.health or self.inbox.health(time_s)
         if math.isnan(time_s):
             sensors = dict.fromkeys(sensors, "lost")
@@ -366,6 +366,7 @@ class RobotSession:
             },
             "target_of": next(iter(target.values())).terrain,
             **known,
+            "slip_unknown": (seen.reason if seen is not None else NOT_ESTIMATED) or None,
             "sensors": sensors,
             "served": self.served.number,
             "late": self.late or None,

@@ -30,6 +30,7 @@ ByFilter = Literal["encoder12", "vio12", "vio15", "skid"]
 """Filters, the numbers being those of their states."""
 
 ByObserver = Literal[
+    "slip",
     "tracked",
     "slip-odometry",
     "slip-learning",
@@ -40,7 +41,7 @@ ByObserver = Literal[
     "sideslip-dynamic",
     "sideslip-multi",
 ]
-"""Observers of slip of tracked robots, and of car-like ones."""
+"""Slip of any robot by what measures its motion over ground; observers of tracked robots, and of car-like ones."""
 
 Filter = Literal[ByFilter, ByObserver, "pose"]
 """One of them; or ``pose``, slip against an outside measurement of motion."""
@@ -79,7 +80,8 @@ class PoseSettings(BaseSettings):
 class EstimateOptions(PoseSettings, SlipModelSettings, NoiseSettings):
     """How slip is found."""
 
-    filter: Filter = setting(..., "Filter or observer; 'pose' is slip against a pose from outside.")
+    filter: Filter | None = setting(None)
+    """Filter or observer, by default the one that suits robot and logs; 'pose' is slip against a pose from outside."""
 
 
 GROUPS: dict[str, type[BaseSettings]] = {
@@ -131,7 +133,7 @@ class Estimates:
 def estimate_runs(
     runs: Iterable[RunLog],
     robot: Robot | None = None,
-    filter: Filter = "skid",
+    filter: Filter | None = None,
     *,
     progress: Progress | None = None,
     **options: Any,
@@ -142,7 +144,8 @@ def estimate_runs(
     ----------
     runs : logs
     robot : whose they are; by default each that a run names
-    filter : filter, observer or ``pose``
+    filter : filter, observer or ``pose``; by default the one that suits the robot and what all logs measure
+        (:func:`terrain.estimation.models.choice.suitable_filter`)
     progress : gets the runs that are done
     options : fields of :class:`EstimateOptions`, as ``tuning`` or ``window_s``
 
@@ -158,9 +161,9 @@ def estimate_runs(
     >>> from terrain.robots import load_robot
     >>> from terrain.simulation.run import simulate_run
     >>> run = simulate_run(load_robot("agrimaro"), "grass", "straight", 0, duration_s=4.0)
-    >>> tracks = estimate_runs([run], filter="vio15")
-    >>> sorted(set(tracks.runs[0].streams) - set(run.streams))
-    ['estimator', 'slip', 'state']
+    >>> tracks = estimate_runs([run])
+    >>> tracks.result.filter, sorted(set(tracks.runs[0].streams) - set(run.streams))
+    ('vio15', ['estimator', 'slip', 'state'])
     """
     from pipelines.report.results import silent
 
@@ -210,7 +213,20 @@ def _estimated(
     progress: Progress,
     keep: Keep | None,
 ) -> TracksResult:
-    """Estimate by the mode that the filter names."""
+    """Estimate by the mode that the filter names, or that suits the runs."""
+    if options.filter is None:
+        from terrain.errors import DataError
+        from terrain.estimation.models.choice import suitable_filter
+        from terrain.robots import robot_named
+
+        measured = [{name for name, stream in run.streams.items() if len(stream)} for run in runs]
+        names = {
+            suitable_filter(robot or robot_named(run.robot), set.intersection(*measured)) for run in runs
+        }
+        if len(names) != 1:
+            found = f"runs of robots that need {', '.join(sorted(names))}" if names else "no runs"
+            raise DataError(f"a filter (--filter) is needed for {found}")
+        options = options.model_copy(update={"filter": names.pop()})
     number = 2 if options.filter == "pose" else int(options.filter in get_args(ByObserver))
     options.refuse_others([*GROUPS][number], GROUPS, f"is for {{of}}, not for --filter {options.filter}")
     result: TracksResult = import_module(RESULTS[number]).estimate_all(runs, robot, options, progress, keep)

@@ -61,6 +61,7 @@ def estimate_all(
     keep: Keep | None,
 ) -> FilterResult:
     """Filter runs, as :func:`pipelines.slip.estimate.estimate_runs`."""
+    assert options.filter is not None  # chosen before
     name, tuning = options.filter, tuning_of(options.filter, options.tuning)
     if options.tune_on is not None and tuning != "likelihood":
         raise ConfigError(f"runs to tune on go with the tuning 'likelihood', not {tuning!r}")

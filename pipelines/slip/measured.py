@@ -101,7 +101,7 @@ def estimate_all(
             late_s = found.delays[run.session].applied_s
             over = {"window_s": SHORT_S, "stride_s": SHORT_STRIDE_S, "delay_s": late_s}
             slip = measured_slip(run, robot, **over, whole=True).stream
-            keep(replace(run, streams={**run.streams, "slip": slip}, filter=options.filter), dict)
+            keep(replace(run, streams={**run.streams, "slip": slip}, filter="pose"), dict)
             progress("write runs", done, len(found.runs))
     return MeasuredSlipResult.of(
         options,

@@ -60,6 +60,7 @@ def estimate_all(
     keep: Keep | None,
 ) -> ObserverResult:
     """Run an observer over runs, as :func:`pipelines.slip.estimate.estimate_runs`."""
+    assert options.filter is not None  # chosen before
     name, file = options.filter, options.slip_model
     if file is not None and name not in (*BY_MODEL, "encoder-odometry"):
         raise ConfigError(f"filter {name!r} takes no slip model: leave --slip-model out")
@@ -96,7 +97,8 @@ def report(result: ObserverResult) -> Report:
         times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in run.status_s.items())
         dropped = f"; left out: {sum(run.dropped.values())} samples" if run.dropped else ""
         missing = f"; not measured: {', '.join(run.missing)}" if run.missing else ""
-        statuses.append(f"{run.run_id}: {times}{dropped}{missing}")
+        why = f"; slip is not known: {run.reason}" if run.reason else ""
+        statuses.append(f"{run.run_id}: {times}{dropped}{missing}{why}")
     return tracks_report(
         result,
         f"Slip by the observer {result.filter}",
@@ -121,7 +123,9 @@ def _answer(result: ObserverResult) -> str:
     if errors:
         worst = format_value(max(errors), ".3f", "m")
         return f"The position of {n} is estimated; it is off by at most {worst} RMS in a run."
-    return f"The position of {n} is estimated; slip is not."
+    reasons = sorted({row.reason for row in result.runs if row.reason})
+    why = f": {'; '.join(reasons)}" if reasons else ""
+    return f"The position of {n} is estimated; slip is not{why}."
 
 
 def figures_of(found: ObserverEstimate) -> dict[str, Figure]:

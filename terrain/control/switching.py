@@ -19,7 +19,7 @@ from terrain.records import Sample
 from terrain.status import StatusCode
 
 if TYPE_CHECKING:
-    from terrain.estimation.live import Estimate
+    from terrain.estimation.live import LiveEstimate
 
 #: A robot whose fastest wheel is to turn at least so fast drives: windows are cut from this speed on
 #: (``features.windows.SteadyMotion``).
@@ -184,7 +184,7 @@ class TerrainSource:
         """Windows and samples that were not used, as counts by kind."""
         return {}
 
-    def update(self, sample: Sample, estimates: Sequence[Estimate]) -> list[TerrainEstimate]:
+    def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
         """Take a sample and the estimates made from it; return the terrains found, in most steps none."""
         return []
 
@@ -204,7 +204,7 @@ class KnownTerrain(TerrainSource):
         self._name_of = name_of
         self._last = ""
 
-    def update(self, sample: Sample, estimates: Sequence[Estimate]) -> list[TerrainEstimate]:
+    def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
         """Return the terrain of the sample where it has changed."""
         if not sample.terrain or sample.terrain == self._last:
             return []

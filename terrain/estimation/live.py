@@ -34,7 +34,7 @@ from terrain.estimation.clocks import NEVER, REWIND_S, SampleQueue, check_channe
 from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, Filter, FilterSettings
 from terrain.estimation.health import HealthMonitor
 from terrain.estimation.models import skid
-from terrain.estimation.models.choice import OBSERVERS, make_observer
+from terrain.estimation.models.choice import OBSERVERS, make_observer, suitable_filter
 from terrain.estimation.models.observer import Observer, ObserverFeed, ObserverStatus
 from terrain.estimation.models.swerve import make_filter, scheduled
 from terrain.estimation.wheel_slip import STALE_AFTER_S, WheelSlip
@@ -71,7 +71,8 @@ class LiveEstimate(NamedTuple):
     slip_std: Array
     slip_stale: bool  #: whether the speed over ground was not measured lately
     reference_age_s: float  #: time since it was; infinite before the first time
-    rows: Array  #: (32,) what was measured, in the order of :data:`~terrain.estimation.feed.ROWS`
+    #: (32,) what was measured, in the order of :data:`~terrain.estimation.feed.ROWS`; (0,) of an observer
+    rows: Array
     speed_x_mps: float  #: of the states, by name; of a robot that skids the speed is that of its wheels
     speed_y_mps: float
     yaw_rate_radps: float
@@ -86,6 +87,9 @@ class LiveEstimate(NamedTuple):
     #: what is known of the motion of a robot that skids; UNKNOWN of others
     motion: skid.Motion = skid.Motion.UNKNOWN
     stuck_since_s: float = math.nan  #: when the robot became stuck; NaN where it is not
+    slip: Array = np.empty(0)  #: of an observer, in the order of its slips, which may be angles
+    status: ObserverStatus = ObserverStatus.OK  #: of the estimates of an observer
+    reason: str = ""  #: why slip is not known, in a sentence; empty where it is
 
 
 class Tick(NamedTuple):
@@ -531,17 +535,6 @@ class LiveFilter(Live):
         )
 
 
-class LiveObserverEstimate(NamedTuple):
-    """What is known at one tick; arrays are the caller's to keep."""
-
-    time_s: float  #: stamp of the wheels
-    mean: Array  #: as of :class:`~terrain.estimation.models.observer.ObserverOutput`
-    std: Array
-    slip: Array
-    slip_std: Array
-    status: ObserverStatus  #: of the estimates
-
-
 class LiveObserver(Live):
     """An observer, before its first step, of a corrected robot; columns of each stream are ``channels``.
 
@@ -549,7 +542,7 @@ class LiveObserver(Live):
     """
 
     filter: None = None
-    latest: LiveObserverEstimate | None
+    latest: LiveEstimate | None
 
     def __init__(
         self,
@@ -560,7 +553,13 @@ class LiveObserver(Live):
     ) -> None:
         terms = () if correction is None else correction.axle_terms
         self.observer, self._feed = observer, ObserverFeed(robot, observer.rows, channels, terms)
-        self.name, self.states = observer.name, observer.states
+        self.name, self.states, self._robot = observer.name, observer.states, robot
+        currents = [f"current_{wheel}_a" for wheel in robot.wheels]
+        self._current_columns = feed.places_among(currents, channels["wheels"])
+        self._motion_places = feed.places_among(_MOTION, observer.states).tolist()
+        self._logged = np.isin(robot.wheels, robot.logged_wheels)
+        ratios = tuple(f"slip_{wheel}_ratio" for wheel in robot.logged_wheels)
+        self._slips_of_wheels = observer.slips == ratios
         super().__init__(channels, self._feed.queues, 0.0, correction)
 
     @property
@@ -581,24 +580,54 @@ class LiveObserver(Live):
         for one, snapshot in zip((self._feed, self.observer), memory, strict=True):
             one.restore(snapshot)
 
-    def _estimate(self, tick: Tick, leapt: Tick | None) -> LiveObserverEstimate:
+    def _estimate(self, tick: Tick, leapt: Tick | None) -> LiveEstimate:
+        observer, robot = self.observer, self._robot
         due = {name: queue.take(tick.time_s) for name, queue in self._queues.items()}
         dt_s = 0.0 if self._feed.last_s == -math.inf else tick.time_s - self._feed.last_s
         wheels = self._no_wheels if tick.wheels is None else tick.wheels
-        output = self.observer.step(self._feed.tick(tick.time_s, wheels, due), dt_s)
-        return LiveObserverEstimate(tick.time_s, *output[:4], ObserverStatus(output.status))
+        output = observer.step(self._feed.tick(tick.time_s, wheels, due), dt_s)
+        v_x, v_y, turn = (
+            math.nan if place < 0 else float(output.mean[place]) for place in self._motion_places[:3]
+        )
+        by_wheel = np.full((3, len(robot.wheels)), math.nan)  # speed, slip and its deviation
+        by_wheel[0, self._logged] = self._feed.speeds_mps
+        if self._slips_of_wheels:
+            by_wheel[1:, self._logged] = output.slip, output.slip_std
+        age_s = observer.reference_age_s
+        return LiveEstimate(
+            tick.time_s,
+            output.mean,
+            output.std,
+            by_wheel[1],
+            by_wheel[2],
+            age_s > STALE_AFTER_S,
+            age_s,
+            np.empty(0),
+            v_x,
+            v_y,
+            turn,
+            observer.accel_mps2,
+            turn * v_x,
+            by_wheel[0] / self._feed.mps_per_rate if robot.by_motor else by_wheel[0] * math.nan,
+            np.append(wheels, np.nan)[self._current_columns],
+            by_wheel[0],
+            np.empty(0, np.int8),
+            slip=output.slip,
+            status=ObserverStatus(output.status),
+            reason=observer.reason,
+        )
 
 
-Estimate = LiveEstimate | LiveObserverEstimate
 Estimator = LiveFilter | LiveObserver
 
 #: Filters and observers that run sample by sample, by drive, without a file of their own; the first is used where
 #: none is named.
 LIVE_FILTERS: Mapping[str, tuple[str, ...]] = {
     "swerve": ("vio15", "vio12", "encoder12"),
-    "skid_steer": ("skid",),
-    "tracked": ("skid", "tracked", "slip-learning", "gyrodometry", "encoder-odometry"),
-    "bicycle": ("sideslip-multi", "sideslip-dynamic", "sideslip-kinematic"),
+    "skid_steer": ("skid", "slip"),
+    "tracked": ("skid", "slip", "tracked", "slip-learning", "gyrodometry", "encoder-odometry"),
+    "bicycle": ("sideslip-multi", "sideslip-dynamic", "sideslip-kinematic", "slip"),
+    **dict.fromkeys(("tricycle", "omni", "mecanum"), ("slip",)),
 }
 
 
@@ -620,6 +649,13 @@ def make_live_filter(
     return LiveFilter(robot, name, channels, rate_hz=rate_hz if name == "skid" else {}, correction=correction)
 
 
+def live_estimator(
+    robot: Robot, channels: Mapping[str, tuple[str, ...]], correction: Correction | None = None
+) -> Estimator:
+    """Return the filter that suits a corrected robot and what is measured of it (:func:`~.choice.suitable_filter`)."""
+    return make_live_filter(suitable_filter(robot, channels), robot, channels, {}, correction)
+
+
 def estimated_channels(name: str, robot: Robot) -> dict[str, tuple[str, ...]]:
     """Return the channels of the streams :data:`ESTIMATED` that a filter or an observer of a robot gives.
 
@@ -636,9 +672,9 @@ def estimated_channels(name: str, robot: Robot) -> dict[str, tuple[str, ...]]:
     return {"estimator": motion, "slip": tuple(f"slip_{wheel}_ratio" for wheel in robot.wheels)}
 
 
-def estimated_values(stream: str, estimate: Estimate) -> Array:
+def estimated_values(stream: str, estimate: LiveEstimate) -> Array:
     """Return a row of one of :data:`ESTIMATED`, in the order of :func:`estimated_channels`."""
-    if isinstance(estimate, LiveObserverEstimate):
+    if estimate.rows.size == 0:  # of an observer
         return estimate.slip if stream == "slip" else estimate.mean
     if stream == "slip":
         return estimate.slip_ratio

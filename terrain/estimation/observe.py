@@ -52,7 +52,7 @@ class ObserverEstimate:
         x, y, yaw = (self.true(name) for name in ("position_x_m", "position_y_m", "yaw_rad"))
         if x is None or y is None or yaw is None:
             return own, None
-        if "position_x_m" not in self.observer.rows:
+        if not ("position_x_m" in self.observer.rows or self.observer.in_world):
             own = own * np.exp(1j * yaw[0]) + x[0] + 1j * y[0]
         return own, x + 1j * y
 
@@ -123,6 +123,7 @@ class ObserverSummary:
     status_s: Mapping[str, float]  #: how long it had each status
     dropped: Mapping[str, int]  #: samples left out, as counts by kind
     missing: tuple[str, ...]  #: what the observer takes and the run never has
+    reason: str  #: why slip is not known in all of it, in a sentence; empty where it is
     finite: bool  #: whether positions are finite once the observer has started, and nothing is infinite
 
 
@@ -153,6 +154,7 @@ def summarize_observer(found: ObserverEstimate) -> ObserverSummary:
         },
         dropped=dict(found.dropped),
         missing=found.missing,
+        reason="" if np.isfinite(track.slip).any() else found.observer.reason,
         finite=bool(np.isfinite(track.mean[started][:, :2]).all())
         and not any(np.isinf(part).any() for part in track[3:7]),
     )

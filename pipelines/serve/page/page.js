@@ -254,9 +254,10 @@
     const title = state.wheels.map((name, i) => "wheel " + name + " " + ["solid", "dashed", "dotted", "dash-dot"][i % 4]).join(", ");
     plots.current = plotIn(figureIn(byId("current"), title || "no wheels described"), state.wheels.map((_, i) => ({ stroke: COLOURS[i % COLOURS.length], width: 2, dash: [[], [8, 4], [2, 3], [8, 3, 2, 3]][i % 4], points: { show: false } })), [], currentRange);
   }
-  function showSlip(there) {
+  function showSlip(there, reason) {
     byId("slip").hidden = byId("slip-note").hidden = !there;
-    byId("slip-none").hidden = there;
+    byId("slip-none").hidden = there && !reason;
+    byId("slip-none").textContent = reason ? "Slip is not known: " + reason + "." : "Slip is not known yet.";
   }
   function draw() {
     requestAnimationFrame(draw);

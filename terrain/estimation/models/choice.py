@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from functools import partial
 from typing import Any
 
@@ -41,8 +41,41 @@ OBSERVERS_OF_DRIVE: Mapping[str, Mapping[str, Callable[[Any, SlipModel], Observe
 BY_MODEL = ("slip-odometry", "endo")
 """Observers that are nothing without a slip model."""
 
-OBSERVERS: tuple[str, ...] = tuple(dict.fromkeys(name for known in OBSERVERS_OF_DRIVE.values() for name in known))
+OBSERVERS: tuple[str, ...] = tuple(
+    dict.fromkeys(name for known in OBSERVERS_OF_DRIVE.values() for name in known)
+)
 """Names of all observers."""
+
+
+REFERENCES = ("gnss", "pose", "lidar", "odometry")
+"""Streams that measure the motion over ground."""
+
+
+def suitable_filter(robot: Robot, streams: Container[str]) -> str:
+    """Return the filter or observer that makes most of what a log or a robot measures.
+
+    Of swerve robots that with a camera, or without; of others ``slip`` where anything measures the motion over ground,
+    and where nothing does ``skid`` of robots that skid, as slip is not observable then.
+
+    Parameters
+    ----------
+    robot : of any drive; one whose description lists filters gets one of those
+    streams : that are measured
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> husky = load_robot("husky")
+    >>> suitable_filter(husky, ("wheels", "imu")), suitable_filter(husky, ("wheels", "imu", "gnss"))
+    ('skid', 'slip')
+    """
+    if robot.drive == "swerve":
+        name = "vio15" if "odometry" in streams and robot.describes("camera") else "encoder12"
+    elif robot.skids and not any(stream in streams for stream in REFERENCES):
+        name = "skid"
+    else:
+        name = "slip"
+    return robot.filters[0] if robot.filters and name not in robot.filters else name
 
 
 def observers_of(robot: Robot) -> tuple[str, ...]:

@@ -72,7 +72,7 @@ CLOCK_SET_SAMPLES = 10
 """So many samples in a row, a second behind the newest, are of a clock that was set back."""
 
 FIX_STD_M, FLOAT_STD_M = 0.02, 0.5
-"""Of a position whose standard deviation is not given: with a fix (RTK), and without one, or where that is not known."""
+"""Of a position whose standard deviation is not given: with a fix (RTK), and without one, or where neither is known."""
 
 CHANNELS: Mapping[str, tuple[str, ...]] = {
     "steering": ("angle_front_rad",),
@@ -88,7 +88,12 @@ CHANNELS: Mapping[str, tuple[str, ...]] = {
 }
 """Channels that are read of each stream beside the wheels; those that a log lacks are unknown."""
 
-STREAM_OF_FIX = {"gnss": ("gnss",), "pose": ("pose",), "compass": ("compass",), "camera": ("odometry", "lidar")}
+STREAM_OF_FIX = {
+    "gnss": ("gnss",),
+    "pose": ("pose",),
+    "compass": ("compass",),
+    "camera": ("odometry", "lidar"),
+}
 """Streams of each sensor of :data:`FIX_ROWS`; the first that is measured counts, and no lidar beside its own poses."""
 
 
@@ -156,13 +161,19 @@ class Observer(ABC, _WithMemory):
     name : as ``terrain estimate --filter`` has it
     states : name of each estimate, with its unit
     slips : channels of the stream ``slip``: ``slip_<wheel>_ratio`` or, of an angle, ``slip_<wheel>_rad``
-    rows : what it takes at a tick, of :data:`ROWS`
+    rows : what it takes at a tick
+    in_world : whether positions are in the frame of what measures them, and not from where the robot started
+    reference_age_s : time since the motion over ground was measured; NaN where an observer does not tell
+    accel_mps2 : acceleration ahead, without a sensor's bias; NaN where it is not known
+    reason : why slip is not known, in a sentence; empty where it is, or an observer does not tell
     """
 
     name: str
     states: tuple[str, ...]
     slips: tuple[str, ...]
     rows: tuple[str, ...]
+    in_world = False
+    reference_age_s, accel_mps2, reason = math.nan, math.nan, ""
 
     @abstractmethod
     def step(self, row: Array, dt_s: float) -> ObserverOutput:
@@ -248,13 +259,22 @@ class ObserverFeed(_WithMemory):
         self._robot, self._terms, wheels = robot, tuple(terms), channels.get("wheels", ())
         check_channels("wheels", robot.rate_channels, wheels)
         names = map("speed_{}_mps".format, robot.logged_wheels)
-        self._speeds = {name: wheels.index(rate) for name, rate in zip(names, robot.rate_channels, strict=True)}
-        self._mps_per_rate = robot.wheel_radius_m / robot.completed.motors.reduction_ratio if robot.by_motor else 1.0
+        self._speeds = {
+            name: wheels.index(rate) for name, rate in zip(names, robot.rate_channels, strict=True)
+        }
+        self.speeds_mps = np.full(len(self._speeds), math.nan)  # of the logged wheels, at the last tick
+        self.mps_per_rate = (
+            robot.wheel_radius_m / robot.completed.motors.reduction_ratio if robot.by_motor else 1.0
+        )
         self._rows, self._takes_place = rows, "position_x_m" in rows
         self._fixes: dict[str, str] = {}
         for sensor, streams in STREAM_OF_FIX.items():
             measured = [stream for stream in streams if channels.get(stream)]
-            if FIX_ROWS[sensor][0] in rows and measured and not ("lidar" in measured and "pose" in self._fixes):
+            if (
+                FIX_ROWS[sensor][0] in rows
+                and measured
+                and not ("lidar" in measured and "pose" in self._fixes)
+            ):
                 self._fixes[sensor] = measured[0]
         read = {"steering", "imu", *self._fixes.values()}
         read |= {"pose", "gnss", "compass"} if self._takes_place else set()
@@ -294,7 +314,8 @@ class ObserverFeed(_WithMemory):
                 self.dropped["time: clock set"] += 1
                 self.queues[name].taken_s, self.queues[name].n_behind = -math.inf, 0
         row = dict.fromkeys(self._rows, math.nan)
-        speeds = {name: float(wheels[column]) * self._mps_per_rate for name, column in self._speeds.items()}
+        speeds = {name: float(wheels[column]) * self.mps_per_rate for name, column in self._speeds.items()}
+        self.speeds_mps = np.array(list(speeds.values()))
         row |= speeds | dict(zip(INERTIAL_ROWS, self._means("imu", time_s, due), strict=True))
         (row["steer_front_rad"],) = self._means("steering", time_s, due, last=True)
         if self._terms and isinstance(self._robot, BicycleRobot):
@@ -361,7 +382,7 @@ class ObserverFeed(_WithMemory):
         if pose is not None:
             stamp_s, (x, y, yaw) = pose
         elif fix is not None:
-            stamp_s, (x, y, _) = fix
+            stamp_s, (x, y, *_) = fix
             yaw = self._heading[1] if abs(stamp_s - self._heading[0]) <= TOGETHER_S else math.nan
         else:
             return math.nan, math.nan, math.nan if heading is None else heading[1][0]

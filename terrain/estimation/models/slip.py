@@ -1,8 +1,8 @@
-r"""Slip of a robot of any drive, from whatever measures its motion: satellites, poses, a camera or nothing at all.
+r"""Slip of a robot of any drive, from whatever measures its motion: satellites, poses, a camera or a lidar.
 
-The body moves with V = (v_x, v_y, w) at its origin, heading psi.  Row i of the wheels, with the direction and place of a
-wheel in :math:`D_i` (:func:`terrain.kinematics.wheels.rolling_matrix`), its circumferential speed :math:`u_i` and the root
-mean square U of all of them, is
+The body moves with V = (v_x, v_y, w) at its origin, heading psi.  Row i of the wheels, with the direction and place of
+a wheel in :math:`D_i` (:func:`terrain.kinematics.wheels.rolling_matrix`), its circumferential speed :math:`u_i` and the
+root mean square U of all of them, is
 
 .. math:: D_i V = u_i (1 - m_i) - \chi\, t_i - d_i U .
 
@@ -30,8 +30,8 @@ that begins at 0; the angle between the travel by wheels and gyro and that of th
 it to the receiver's frame: fixes are used from there on.  Driving backward is no exception.
 
 **What is not observed.**  Slip is NaN before the first reference of the speed over ground, and where its standard
-deviation passes :data:`UNKNOWN_RATIO`: then nothing is known of it.  Without a reference m walks on, so that slip of the
-ground is remembered through standstill and over seconds without one, with a deviation that grows.
+deviation passes :data:`UNKNOWN_RATIO`: then nothing is known of it.  Without a reference m walks on, so that slip of
+the ground is remembered through standstill and over seconds without one, with a deviation that grows.
 """
 
 from __future__ import annotations
@@ -47,15 +47,16 @@ from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.estimation.filter import (
     GATE_PROBABILITY,
+    LARGEST,
     REOPEN_AFTER_S,
     FilterModel,
     FilterSettings,
     differentiate,
 )
-from terrain.estimation.models.observer import FilterObserver, ObserverOutput, ObserverStatus
+from terrain.estimation.models.observer import FLOAT_STD_M, FilterObserver, ObserverOutput, ObserverStatus
 from terrain.estimation.wheel_slip import wheel_speed_scatter_mps
 from terrain.kernels import njit
-from terrain.kinematics.wheels import STEEPEST_RAD, rolling_matrix
+from terrain.kinematics.wheels import rolling_matrix
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot
 from terrain.slip import MIN_SPEED_MPS, slip_ratio
@@ -86,6 +87,10 @@ ALIGNED_RAD, CRAB_RAD, LOST_RAD = 0.05, 0.05, 0.6
 """Deviation at which a heading by the motion is used; that of the motion from the heading; and one that is lost."""
 LEAST_TRAVEL_M, LEAST_RATIO = 0.5, 0.3
 """Travel by the wheels that shows a heading, and how much of it the receiver has to see."""
+OLDEST_S = 1.0
+"""Age of a fix beyond which there is none."""
+LOST_S, LOST_RATIO = 2.0, 0.9
+"""Time without a reference, and slip of all wheels, from which on the filter begins anew."""
 PREDICTED_S = 0.5
 """Time without a reference from which on slip is predicted."""
 UNKNOWN_RATIO = 0.25
@@ -102,11 +107,13 @@ _MOTION = (
     *("gyro_bias_radps", "accel_bias_x_mps2", "fix_delay_s"),
 )
 _X, _Y, _YAW, _VX, _VY, _W, _GYRO_BIAS, _ACCEL_BIAS, _DELAY, _SLOW = range(10)
-MOST_ROWS = 4
+MOST_ROWS = 6  # of a swerve robot: along and across each wheel
 # Places in `params`: counts and levers, the slow state of each row; and as inputs D, u, t, U, the acceleration, ages.
 _N_ROWS, _N_SLOW, _TURNS, _FREE_ACROSS, _ANTENNA, _POSED, _SEEN, _GROUP = 0, 1, 2, 3, 4, 6, 8, 10
-_D, _U, _T, _SIZE, _ACCEL, _AGES = 14, 26, 30, 34, 35, 36
-_N_AGES = 22  # place of the ages among the inputs
+_D = _GROUP + MOST_ROWS
+_U, _T, _SIZE = _D + 3 * MOST_ROWS, _D + 4 * MOST_ROWS, _D + 5 * MOST_ROWS
+_ACCEL, _AGES = _SIZE + 1, _SIZE + 2
+_SPEEDS, _TURNING = slice(_U - _D, _T - _D), slice(_T - _D, _SIZE - _D)  # among the inputs
 _INPUTS = (
     *(f"d_{i}" for i in range(3 * MOST_ROWS)),
     *(f"{name}_{i}" for name in "ut" for i in range(MOST_ROWS)),
@@ -117,6 +124,7 @@ _REFERENCES = (
     *("gnss_x_m", "gnss_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps"),
     *("pose_x_m", "pose_y_m", "pose_yaw_rad", "compass_rad", "camera_x_mps", "camera_y_mps"),
 )
+_DELAYS = ("pose_delay_s", "lidar_delay_s", "gnss_delay_s")  # of a description, by logs
 _AGE_ROWS = ("gnss_age_s", "pose_age_s", "camera_age_s")
 _INERTIAL = ("yaw_rate_radps", "accel_x_mps2", "pitch_rad")
 
@@ -178,17 +186,25 @@ def _placed(x: Array, age: float, lever_x: float, lever_y: float, params: Array,
 def _measure(x: Array, _dt: float, params: Array, z: Array) -> None:
     z[:] = 0.0
     _wheels(x, params, z)
-    z[4] = x[_W] + x[_GYRO_BIAS]
-    _placed(x, params[_AGES] + x[_DELAY], params[_ANTENNA], params[_ANTENNA + 1], params, z[5:9])
+    z[MOST_ROWS] = x[_W] + x[_GYRO_BIAS]
+    _placed(
+        x,
+        params[_AGES] + x[_DELAY],
+        params[_ANTENNA],
+        params[_ANTENNA + 1],
+        params,
+        z[MOST_ROWS + 1 : MOST_ROWS + 5],
+    )
     pose = np.zeros(4)
     age = params[_AGES + 1] + x[_DELAY]
     _placed(x, age, params[_POSED], params[_POSED + 1], params, pose)
-    z[9], z[10], z[11] = pose[0], pose[1], x[_YAW] - age * x[_W]
-    z[12] = x[_YAW]
-    z[13] = x[_VX] - x[_W] * params[_SEEN + 1]
-    z[14] = x[_VY] + x[_W] * params[_SEEN]
+    fix = z[MOST_ROWS + 5 :]
+    fix[0], fix[1], fix[2] = pose[0], pose[1], x[_YAW] - age * x[_W]
+    fix[3] = x[_YAW]
+    fix[4] = x[_VX] - x[_W] * params[_SEEN + 1]
+    fix[5] = x[_VY] + x[_W] * params[_SEEN]
     if math.isfinite(params[_ACCEL]):
-        z[13] -= (params[_AGES + 2] + x[_DELAY]) * (params[_ACCEL] - x[_ACCEL_BIAS])
+        fix[4] -= (params[_AGES + 2] + x[_DELAY]) * (params[_ACCEL] - x[_ACCEL_BIAS])
 
 
 @njit
@@ -211,27 +227,34 @@ def _ground(x: Array, params: Array) -> tuple[Array, Array]:
 
 
 class WheelRows(NamedTuple):
-    """Rows of the wheels of a robot that are constant: which wheel, and in which slow state its slip is."""
+    """Rows of the wheels of a robot: along each that is logged, and across each that is steered."""
 
     logged: Array  #: (n,) place of each logged wheel among the robot's
+    across: Array  #: (k,) and of each steered one
     groups: tuple[int, ...]  #: slow state of each row
-    n_slow: int
 
 
 def rows_of_wheels(robot: Robot) -> WheelRows:
-    """Return the rows of a robot's wheels: one of each that is logged, and one across a steered front wheel."""
+    """Return the rows of a robot's wheels.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> rows_of_wheels(load_robot("adap2e"))
+    WheelRows(logged=array([1]), across=array([0]), groups=(0, 0))
+    """
     logged = np.flatnonzero(np.isin(robot.wheels, robot.logged_wheels))
-    n = len(logged) + isinstance(robot, BicycleRobot)
-    groups = tuple(range(n)) if robot.skids else (0,) * n
-    return WheelRows(logged, groups, 2 if robot.skids else 1)
+    across = np.flatnonzero(np.isin(robot.wheels, robot.steered_wheels))
+    n = len(logged) + len(across)
+    return WheelRows(logged, across, tuple(range(n)) if robot.skids else (0,) * n)
 
 
 class SlipFilter(FilterObserver):
-    """The slip of a robot of any drive that is not a swerve robot.
+    """The slip of a robot of any drive.
 
     Parameters
     ----------
-    robot : skid-steer, tracked, omni, mecanum, car-like or a tricycle
+    robot : of which ``ConfigError`` is raised where more than :data:`MOST_ROWS` rows describe its wheels
 
     Examples
     --------
@@ -252,23 +275,29 @@ class SlipFilter(FilterObserver):
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self._wheels = robot, rows_of_wheels(robot)
-        logged, groups, n_slow = self._wheels
-        n_rows, turns = len(groups), robot.skids or isinstance(robot, BicycleRobot)
+        logged, _, groups = self._wheels
+        n_slow, n_rows, turns = 1 + max(groups), len(groups), robot.skids or isinstance(robot, BicycleRobot)
         names = [robot.wheels[i] for i in logged.tolist()]
         slow = [f"ground_slip_{name}_ratio" for name in names] if robot.skids else ["ground_slip_ratio"]
         self.states = (*_MOTION, *slow, *["turn_loss_ratio"] * turns)
         self.slips = tuple(f"slip_{name}_ratio" for name in names)
         self._speeds = tuple(f"speed_{name}_mps" for name in names)
-        steer = ("steer_front_rad",) * robot.steered
+        steer = tuple(f"steer_{name}_rad" for name in robot.steered_wheels)
         self.rows = (*self._speeds, *steer, *_INERTIAL, *_REFERENCES, *_AGE_ROWS, "gnss_std_m")
         self._scatter_mps = float(np.fmax(wheel_speed_scatter_mps(robot), WHEEL_STD_MPS))
+        known_s = [robot.identified[name] for name in _DELAYS if name in robot.identified]
+        delay_s, delay_std_s = (known_s[0], 0.3 * DELAY_STD_S) if known_s else (DELAY_S, DELAY_STD_S)
         effective_m = robot.identified.get("effective_track_m")
         loss, loss_std = (0.4, 0.25) if robot.skids else (0.0, 0.15)
         if robot.skids and effective_m is not None:
             loss, loss_std = 1.0 - robot.track_m / max(effective_m, robot.track_m), 0.1
         wheel_rows = tuple(f"wheel_{i}_mps" for i in range(MOST_ROWS))
-        levers = *_lever(robot, "antenna"), *_identified(robot, "pose_x_m", "pose_y_m"), *_lever(robot, "camera")
-        counts = n_rows, n_slow, turns, robot.on_omni_wheels
+        levers = (
+            *_lever(robot, "antenna"),
+            *_identified(robot, "pose_x_m", "pose_y_m"),
+            *_lever(robot, "camera"),
+        )
+        counts = n_rows, n_slow, turns, robot.sideways
         model = FilterModel(
             name=self.name,
             states=(*self.states, *(f"passing_slip_{i}_ratio" for i in range(n_rows))),
@@ -289,12 +318,14 @@ class SlipFilter(FilterObserver):
             process_variance=np.zeros(len(self.states) + n_rows),
             measurement_variance=np.ones(MOST_ROWS + 1 + len(_REFERENCES)),
             initial_variance=np.square(
-                [1e-3, 1e-3, 1e-3, 1.0, 0.1, 0.5, BIAS_STD_RADPS, UNTILTED_STD, DELAY_STD_S]
+                [1e-3, 1e-3, 1e-3, 1.0, 0.1, 0.5, BIAS_STD_RADPS, UNTILTED_STD, delay_std_s]
                 + [SLOW_RATIO] * n_slow
                 + [loss_std] * turns
                 + [FAST_RATIO] * n_rows
             ),
-            initial_mean=np.array([0.0] * _DELAY + [DELAY_S] + [0.0] * n_slow + [loss] * turns + [0.0] * n_rows),
+            initial_mean=np.array(
+                [0.0] * _DELAY + [delay_s] + [0.0] * n_slow + [loss] * turns + [0.0] * n_rows
+            ),
             inputs=_INPUTS,
             references=("pose", "gnss_position", "gnss_speed", "camera"),
             positions=_MOTION[:2],
@@ -303,31 +334,43 @@ class SlipFilter(FilterObserver):
         )
         super().__init__(model, FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S))
         place = robot.wheel_positions_m, robot.wheel_directions_rad, robot.roller_angles_rad
-        self._rolling = rolling_matrix(*place)[logged]
+        self._rolling, self._steer = rolling_matrix(*place)[logged], steer
         self._smooth_mps, self._accel_mps2, self._shaken_square = np.full(len(logged), np.nan), math.nan, 0.0
         self._is_placed, self._first, self._seen, self._weight = False, np.full(2, np.nan, complex), 0j, 0.0
         self._known = np.full(len(logged), np.nan)
 
     def step(self, row: Array, dt_s: float) -> ObserverOutput:
         """Take a row of :attr:`rows`; the frame begins at the first pose, or where the heading becomes known."""
-        given = dict(zip(self.rows, row.tolist(), strict=True))
+        given = {
+            name: value if abs(value) <= LARGEST else math.nan
+            for name, value in zip(self.rows, row.tolist(), strict=True)
+        }
         dt_s = dt_s if 0.0 <= dt_s < math.inf else 0.0
         speeds = np.array([given[name] for name in self._speeds])
         speeds[~(np.abs(speeds) <= MOST_MPS)] = np.nan
         rates_mps2 = self._rates(speeds, dt_s)
-        inputs = self._inputs(given, speeds, dt_s)
-        z = np.full(MOST_ROWS, np.nan)
-        z[: speeds.size] = 0.0 * speeds
-        if len(self._wheels.groups) > speeds.size and math.isfinite(given["steer_front_rad"]):
-            z[speeds.size] = z[0]
+        angles = np.array([given[name] for name in self._steer])
+        inputs = self._inputs(given, speeds, angles, dt_s)
+        z, logged, across = np.full(MOST_ROWS, np.nan), *self._wheels[:2]
+        z[: logged.size] = np.where(np.isin(logged, across[np.isnan(angles)]), np.nan, 0.0 * speeds)
+        if np.isfinite(speeds).any():
+            z[logged.size : logged.size + across.size] = 0.0 * angles
         gyro = given["yaw_rate_radps"]
         references = self._place(given, inputs)
         z = np.concatenate([z, [gyro if abs(gyro) <= MOST_RADPS else np.nan], references])
         variance = self._variance(given, rates_mps2, dt_s)
         fix = self.advance(dt_s, z, inputs, self._walk(given, inputs, rates_mps2, dt_s), variance, N_JUDGED)
-        if self._is_placed and self.filter.cov[_YAW, _YAW] > LOST_RAD**2:
-            self._is_placed, self._first[:] = False, np.nan
-        return self._output(speeds, inputs, fix)
+        output = self._output(speeds, inputs, fix)
+        is_lost = self.filter.reference_age_s > LOST_S and (np.abs(output.slip) > LOST_RATIO).all()
+        if is_lost:  # what it believes of the motion follows from nothing that is measured
+            self.filter.mean[:], self.filter.cov[:] = (
+                self.filter.model.initial_mean,
+                self.filter.model.initial_variance,
+            )
+            self.filter.state["reference_age_s"] = math.inf
+        if is_lost or (self._is_placed and self.filter.cov[_YAW, _YAW] > LOST_RAD**2):
+            self._is_placed, self._seen, self._weight, self._first[:] = False, 0j, 0.0, np.nan
+        return output
 
     def _rates(self, speeds: Array, dt_s: float) -> Array:
         """Return how fast the speeds of the wheels change, behind a low-pass; 0 where that is not known."""
@@ -335,23 +378,25 @@ class SlipFilter(FilterObserver):
         gain = -math.expm1(-dt_s / CHANGE_S)
         moved = np.where(np.isfinite(self._smooth_mps), self._smooth_mps + gain * behind, speeds)
         self._smooth_mps = np.where(np.isfinite(speeds), moved, self._smooth_mps)
-        return behind / CHANGE_S
+        return np.asarray(behind / CHANGE_S)
 
-    def _inputs(self, given: Mapping[str, float], speeds: Array, dt_s: float) -> Array:
+    def _inputs(self, given: Mapping[str, float], speeds: Array, angles: Array, dt_s: float) -> Array:
         """Return the inputs of a tick; a steered wheel's direction is that of its angle."""
-        n, inputs = speeds.size, np.zeros(len(_INPUTS))
-        known = np.nan_to_num(speeds)
-        rolling = np.zeros((MOST_ROWS, 3))
-        rolling[:n], turning = self._rolling, np.zeros(MOST_ROWS)
+        n, inputs, (logged, across, _) = speeds.size, np.zeros(len(_INPUTS)), self._wheels
+        known, rolling, turning = np.nan_to_num(speeds), np.zeros((MOST_ROWS, 3)), np.zeros(MOST_ROWS)
+        rolling[:n] = self._rolling
+        if self._steer:
+            directions, positions_m = (
+                np.array(self._robot.wheel_directions_rad),
+                self._robot.wheel_positions_m,
+            )
+            directions[across] += np.nan_to_num(angles)
+            rolling[:n] = rolling_matrix(positions_m, directions)[logged]
+            rolling[n : n + across.size] = rolling_matrix(positions_m, directions + 0.5 * math.pi)[across]
         if self._robot.skids:
             turning[:2] = np.array([-0.5, 0.5]) * (known[1] - known[0])
         elif isinstance(self._robot, BicycleRobot):
-            angle = given["steer_front_rad"]
-            angle = min(max(angle, -STEEPEST_RAD), STEEPEST_RAD) if math.isfinite(angle) else 0.0
-            cos, sin, base_m = math.cos(angle), math.sin(angle), self._robot.wheelbase_m
-            if self._robot.front_driven:
-                rolling[0] = cos, sin, sin * base_m
-            rolling[1], turning[1] = (-sin, cos, cos * base_m), sin * known[0]
+            turning[n] = rolling[0, 0] * known[0] * math.sin(float(directions[0]))
         accel = given["accel_x_mps2"]
         if math.isfinite(given["pitch_rad"]):  # the specific force at rest is -g sin(pitch)
             accel += GRAVITY_MPS2 * math.sin(given["pitch_rad"])
@@ -363,9 +408,10 @@ class SlipFilter(FilterObserver):
             self._accel_mps2 += gain * apart
             self._shaken_square += gain * (apart * apart - self._shaken_square)
         size = math.sqrt(float(np.mean(known**2)))
-        ages = [given[name] if math.isfinite(given[name]) else 0.0 for name in _AGE_ROWS]
-        inputs[:12], inputs[12 : 12 + n], inputs[16:20] = rolling.ravel(), known, turning
-        inputs[20:] = size, accel, *ages
+        ages = [given[name] if 0.0 <= given[name] <= OLDEST_S else 0.0 for name in _AGE_ROWS]
+        inputs[: 3 * MOST_ROWS], inputs[_SPEEDS][:n], inputs[_TURNING] = rolling.ravel(), known, turning
+        inputs[_SIZE - _D :] = size, accel, *ages
+        self.accel_mps2 = accel - float(self.filter.mean[_ACCEL_BIAS])
         return inputs
 
     def _variance(self, given: Mapping[str, float], rates_mps2: Array, dt_s: float) -> Array:
@@ -377,7 +423,7 @@ class SlipFilter(FilterObserver):
         std = np.full(MOST_ROWS + 1 + len(_REFERENCES), self._scatter_mps)
         std[: rates_mps2.size] = np.hypot(self._scatter_mps, 0.29 * dt_s * rates_mps2)
         late_mps = 0.0 if math.isfinite(given["accel_x_mps2"]) else given["gnss_age_s"] * FREE_WALK
-        fix_m = given["gnss_std_m"]
+        fix_m = given["gnss_std_m"] if given["gnss_std_m"] > 0.0 else FLOAT_STD_M
         std[MOST_ROWS:] = (
             *(GYRO_STD_RADPS, fix_m, fix_m, *[math.hypot(GNSS_SPEED_STD_MPS, late_mps)] * 2),
             *(POSE_STD_M, POSE_STD_M, POSE_STD_RAD, COMPASS_STD_RAD, CAMERA_STD_MPS, CAMERA_STD_MPS),
@@ -386,17 +432,18 @@ class SlipFilter(FilterObserver):
 
     def _walk(self, given: Mapping[str, float], inputs: Array, rates_mps2: Array, dt_s: float) -> Array:
         """Return what the variance of each state grows by in a second, up to this tick."""
-        n_rows, n_slow, size = len(self._wheels.groups), self._wheels.n_slow, float(inputs[20])
+        n_rows, size = len(self._wheels.groups), float(inputs[_SIZE - _D])
+        n_slow = 1 + max(self._wheels.groups)
         dt_s, walk = max(dt_s, 1e-6), np.zeros(len(self.filter.model.states))
-        has_accel, has_pitch = math.isfinite(inputs[21]), math.isfinite(given["pitch_rad"])
+        has_accel, has_pitch = math.isfinite(inputs[_ACCEL - _D]), math.isfinite(given["pitch_rad"])
         shaken = SHAKEN_RATIO * math.sqrt(self._shaken_square)
         walk[_VX] = (ACCEL_WALK + shaken if has_accel else FREE_WALK) ** 2
         turn_radps = abs(float(self.filter.mean[_W]))
         across = (ACROSS_RATIO * size + ACROSS_M * turn_radps) ** 2
-        walk[_VY] = FREE_WALK**2 if self._robot.on_omni_wheels else _fading(across, ACROSS_S, dt_s)
+        walk[_VY] = FREE_WALK**2 if self._robot.sideways else _fading(across, ACROSS_S, dt_s)
         walk[_W], walk[_GYRO_BIAS] = YAW_ACCEL**2, BIAS_WALK**2
         walk[_ACCEL_BIAS] = (TILTED_WALK if has_pitch else UNTILTED_WALK) ** 2
-        tight = float(np.abs(inputs[16:20]).max()) / size if size > STANDING_MPS else 0.0
+        tight = float(np.abs(inputs[_TURNING]).max()) / size if size > STANDING_MPS else 0.0
         if size > STANDING_MPS:
             walk[_SLOW : _SLOW + n_slow] = SLOW_WALK**2
             walk[_SLOW + n_slow : len(self.states)] = (TURN_WALK * tight) ** 2
@@ -409,7 +456,12 @@ class SlipFilter(FilterObserver):
         z = np.array([given[name] for name in _REFERENCES])
         if self._is_placed:
             return z
-        mean, cov, params, ages_s = self.filter.mean, self.filter.cov, self.filter.model.params, inputs[_N_AGES:]
+        mean, cov, params, ages_s = (
+            self.filter.mean,
+            self.filter.cov,
+            self.filter.model.params,
+            inputs[_AGES - _D :],
+        )
         yaw, turn_radps = float(mean[_YAW]), float(mean[_W])
         fix, pose = complex(z[0], z[1]), complex(z[4], z[5])
         lever, age_s, std_m = complex(*params[_ANTENNA:_POSED]), float(ages_s[0]), given["gnss_std_m"]
@@ -443,8 +495,8 @@ class SlipFilter(FilterObserver):
     ) -> tuple[float, float]:
         """Return the angle from the filter's own frame to the receiver's, and its deviation; infinite where unknown.
 
-        By the travel since the first fix, and by the receiver's speeds; ``at`` and ``velocity`` are those of the antenna
-        in the filter's own frame.  A wheel that spins shows no heading: the receiver has to move as well.
+        By the travel since the first fix, and by the receiver's speeds; ``at`` and ``velocity`` are those of the
+        antenna in the filter's own frame.  A wheel that spins shows no heading: the receiver has to move as well.
         """
         angle, std = math.nan, math.inf
         if not cmath.isnan(speed) and min(abs(speed), abs(velocity)) >= LEAST_MPS:
@@ -455,10 +507,10 @@ class SlipFilter(FilterObserver):
             if np.isnan(self._first[0]):
                 self._first[:] = fix, at
             seen, travelled = fix - complex(self._first[0]), at - complex(self._first[1])
-            scatter_m = math.sqrt(2.0) * fix_std_m
-            if abs(travelled) >= LEAST_TRAVEL_M and abs(seen) >= LEAST_RATIO * abs(travelled):
-                if scatter_m / abs(seen) < std:
-                    angle, std = cmath.phase(seen * travelled.conjugate()), scatter_m / abs(seen)
+            scatter = math.sqrt(2.0) * fix_std_m / max(abs(seen), 1e-9)
+            moved = abs(travelled) >= LEAST_TRAVEL_M and abs(seen) >= LEAST_RATIO * abs(travelled)
+            if moved and scatter < std:
+                angle, std = cmath.phase(seen * travelled.conjugate()), scatter
         return angle, math.hypot(std, CRAB_RAD)
 
     def _output(self, speeds: Array, inputs: Array, fix: ObserverStatus) -> ObserverOutput:
@@ -471,7 +523,9 @@ class SlipFilter(FilterObserver):
         slower = np.fmin(np.abs(speeds), np.abs(ground[:n])) / np.fmax(fastest, MIN_SPEED_MPS)
         traction = np.abs(speeds) >= np.abs(ground[:n])
         by_ground, by_wheel = np.where(traction, 1.0, slower), np.where(traction, slower, 1.0)
-        deviation = np.hypot(by_ground * std[:n], by_wheel * self._scatter_mps) / np.fmax(fastest, MIN_SPEED_MPS)
+        deviation = np.hypot(by_ground * std[:n], by_wheel * self._scatter_mps) / np.fmax(
+            fastest, MIN_SPEED_MPS
+        )
         unknown = np.isnan(slip) | (deviation > UNKNOWN_RATIO) | (age_s == math.inf)
         slip[unknown] = deviation[unknown] = math.nan
         d = len(self.states)
@@ -480,18 +534,20 @@ class SlipFilter(FilterObserver):
             status = ObserverStatus.STARTING
         elif not np.isfinite(speeds).any():
             status = ObserverStatus.BAD_INPUT
-        elif fix is ObserverStatus.OK and float(inputs[20]) < STANDING_MPS:
+        elif fix is ObserverStatus.OK and float(inputs[_SIZE - _D]) < STANDING_MPS:
             status = ObserverStatus.STANDING
         elif fix is ObserverStatus.OK and age_s > PREDICTED_S:
             status = ObserverStatus.PREDICTED
-        self.reason = self._reason(age_s, deviation)
+        self.reference_age_s, self.reason = age_s, self._reason(age_s, deviation)
         std = np.sqrt(np.maximum(self.filter.cov.diagonal()[:d], 0.0))
         return ObserverOutput(mean[:d].copy(), std, slip, deviation, int(status))
 
     def _reason(self, age_s: float, deviation: Array) -> str:
         """Return why slip is unknown, in a sentence; empty where it is known or the robot stands."""
         if age_s == math.inf and (self._weight > 0.0 or not np.isnan(self._first[0])):
-            return f"the heading is not known yet: it follows from a motion of {LEAST_TRAVEL_M:g} m with fixes"
+            return (
+                f"the heading is not known yet: it follows from a motion of {LEAST_TRAVEL_M:g} m with fixes"
+            )
         if age_s == math.inf:
             return "nothing has measured the speed over ground: no fix, pose or camera"
         if age_s > PREDICTED_S and np.isnan(deviation).all():

@@ -10,7 +10,9 @@ from terrain.estimation.filter import FilterModel, FilterSettings, differentiate
 from terrain.estimation.live import LiveObserver
 from terrain.estimation.models.choice import OBSERVERS, make_observer, observers_of
 from terrain.estimation.models.observer import (
-    ROWS,
+    FIX_ROWS,
+    INERTIAL_ROWS,
+    PLACE_ROWS,
     FilterObserver,
     ObserverFeed,
     ObserverOutput,
@@ -36,8 +38,8 @@ from terrain.simulation.run import simulate
 UGV, CAR, HUSKY = (load_robot(name) for name in ("orchard_ugv", "adap2e", "husky"))
 ROBOTS = {name: UGV if name in observers_of(UGV) else CAR for name in OBSERVERS}
 ANY = pytest.mark.parametrize("name", OBSERVERS)
-FIX = ROWS[4:7]
-NAMES = tuple(name for name in ROWS if "rear" not in name and "front" not in name)
+FIX = PLACE_ROWS
+NAMES = ("speed_left_mps", "speed_right_mps", *PLACE_ROWS, *INERTIAL_ROWS[:4])
 
 
 def made(name):
@@ -162,9 +164,11 @@ def test_samples_that_cannot_be_are_left_out_and_counted(turning):
 def straight_rows(name, n):
     """Return rows (n, m) of motion ahead at 0.6 m/s without slip, at 50 Hz, with a fix every fifth tick."""
     names = made(name).rows
-    still = ("yaw_rate_radps", "roll_rad", "pitch_rad", "steer_front_rad", "accel_y_mps2")
+    still = (*INERTIAL_ROWS, "steer_front_rad", "gnss_age_s", "gnss_speed_y_mps")
     rows = np.tile(np.where(np.isin(names, still), 0.0, 0.6), (n, 1))
-    for place, speed_mps in zip(FIX, (0.6, 0.0, 0.0), strict=True):
+    rows[:, np.isin(names, [row for row in names if row.startswith(("pose", "compass", "camera"))])] = np.nan
+    rows[:, np.isin(names, "gnss_std_m")] = 0.02
+    for place, speed_mps in zip((*FIX, *FIX_ROWS["gnss"]), (0.6, 0.0, 0.0, 0.6, 0.0), strict=False):
         if place in names:
             rows[:, names.index(place)] = np.nan
             rows[::5, names.index(place)] = 0.02 * speed_mps * np.arange(0, n, 5)
@@ -225,12 +229,12 @@ def test_a_fix_that_cannot_be_is_rejected_a_lasting_one_resets_the_pose_alone_an
 
 
 def test_a_robot_has_the_observers_of_its_description():
-    assert observers_of(HUSKY) == ()
+    assert observers_of(HUSKY) == ("slip",)
     only = replace(UGV, filters=("tracked",))
     assert observers_of(only) == ("tracked",)
     with pytest.raises(ConfigError, match="filter 'endo' is not for robot orchard_ugv"):
         make_observer("endo", only)
-    with pytest.raises(ConfigError, match="whose drive is skid_steer: none is"):
+    with pytest.raises(ConfigError, match="whose drive is skid_steer: use slip"):
         make_observer("tracked", HUSKY)
 
 
