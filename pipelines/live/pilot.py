@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -35,8 +36,30 @@ from terrain.estimation.feed import places_among
 from terrain.estimation.health import SENSORS, Health
 from terrain.estimation.live import CHANNELS, LiveEstimate, LiveFilter
 from terrain.extension import correct_live
+from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
 from terrain.records import Command, Sample
 from terrain.robots import Robot
+
+
+def pilot_channels(robot: Robot) -> Mapping[str, tuple[str, ...]]:
+    """Return the channels that a pilot of a robot takes, by stream.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> pilot_channels(load_robot("husky"))["wheels"]
+    ('speed_left_mps', 'speed_right_mps', 'current_left_a', 'current_right_a')
+    """
+    if robot.drive == "swerve":
+        return CHANNELS
+    currents = (f"current_{wheel}_a" for wheel in robot.logged_wheels)
+    streams = {"wheels": (*robot.rate_channels, *currents), "imu": IMU_CHANNELS}
+    return streams | {"odometry": ("speed_x_mps", "speed_y_mps"), "gnss": GNSS_CHANNELS}
+
+
+def pilot_estimator(robot: Robot, channels: Mapping[str, tuple[str, ...]], correction: Any) -> Any:
+    """Return what estimates the motion of a corrected robot."""
+    return LiveFilter(robot, PILOT_FILTER, correction=correction)
 
 
 class LivePilot(Chain):
@@ -44,12 +67,13 @@ class LivePilot(Chain):
 
     Parameters
     ----------
-    robot : a swerve robot with all sections
+    robot : of any drive; a swerve robot with all sections
     table : target slips
     source : of the current terrain; without one it stays unknown
     settings : controller and its settings
-    channels : of each stream, in the order of the columns of the samples that :meth:`take` is given; what is
-        not among them is unknown.  Where the steering is measured, :meth:`take` begins with it where it stands
+    channels : of each stream, in the order of the columns of the samples that :meth:`take` is given, by default those
+        of :func:`pilot_channels`; what is not among them is unknown.  Where the steering of a swerve robot is measured,
+        :meth:`take` begins with it where it stands
 
     Raises
     ------
@@ -69,7 +93,7 @@ class LivePilot(Chain):
 
     name = "pilot"
     estimate: LiveEstimate | None
-    _filter: LiveFilter | None
+    _filter: Any
     _clocks: Clocks
 
     def __init__(
@@ -78,23 +102,28 @@ class LivePilot(Chain):
         table: SlipTable | None = None,
         source: TerrainSource | None = None,
         settings: PilotSettings = DEFAULT_SETTINGS,
-        channels: Mapping[str, Sequence[str]] = CHANNELS,
+        channels: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         table = load_slip_table() if table is None else table
-        driven, correction = correct_live(check_pilot(robot, table, settings))
+        check_pilot(robot, table, settings)
+        driven, correction = correct_live(robot)
         super().__init__(robot.name, table, SWITCHING, Clocks())
         self.source = TerrainSource() if source is None else source
+        channels = pilot_channels(driven) if channels is None else channels
+        wanted = pilot_channels(driven)
+        if driven.drive != "swerve":  # their estimator takes what there is
+            wanted = {stream: tuple(names) for stream, names in channels.items()}
         if settings.controller not in OPEN_LOOP:
-            self._filter = LiveFilter(driven, PILOT_FILTER, correction=correction)
+            self._filter = pilot_estimator(driven, wanted, correction)
         states = () if self._filter is None else self._filter.states
-        self.control = RobotControl(driven, table, settings, states)
+        self.control = RobotControl(driven, table, settings, states, wanted)
         self._steering_zeros_rad = np.array(driven.steering_zeros_rad)
         self._columns = {
             stream: None if tuple(channels[stream]) == names else places_among(names, list(channels[stream]))
-            for stream, names in CHANNELS.items()
+            for stream, names in wanted.items()
             if stream in channels
         }
-        self._awaits_steering = "steering" in channels
+        self._awaits_steering = "steering" in channels and driven.drive == "swerve"
         self._time_s, self._standing_rad = math.nan, self.control.steer_rad
 
     def replace(self, model: TerrainModel | None, table: SlipTable) -> None:
@@ -116,6 +145,8 @@ class LivePilot(Chain):
     @property
     def health(self) -> dict[str, str]:
         """Health of each sensor at the last step, by name, as those of ``Health`` in small letters."""
+        if len(self.control.health) != len(SENSORS):
+            return {}
         found = zip(SENSORS, self.control.health, strict=True)
         return {name: Health(status).name.lower() for name, status in found}
 
@@ -148,7 +179,7 @@ class LivePilot(Chain):
     def _standing(self) -> Command:
         """Return the command to stand, steered as before."""
         status = {"status_code": float(TractionStatus.UNSOUND)}
-        return Command(np.zeros(3), self._standing_rad, np.zeros(3), status)
+        return Command(np.zeros(len(self._standing_rad)), self._standing_rad, np.zeros(3), status)
 
     def step(self, sample: Sample) -> Command:
         """Return the wheels' commands for a sample; whatever arrives, it does not raise.

@@ -329,7 +329,8 @@ def run(settings: Settings, progress: Progress = silent) -> BridgeResult:
     interface, channel = bus_of(settings.can or "")
     layout = load_layout(settings.dbc)
     table, pilot = load_slip_table(settings.table), PilotSettings(controller=settings.controller)
-    robot = check_pilot(load_robot(settings.robot or "agrimaro"), table, pilot)
+    robot = load_robot(settings.robot or "agrimaro")
+    check_pilot(robot, table, pilot)
     chain = chain_of(
         robot,
         {name: tuple(SIGNALS[name]) for name in RECEIVED if name != "twist"},

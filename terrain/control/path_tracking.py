@@ -24,6 +24,9 @@ and headings times L::
 - A pose that jumps against the ground speed is relocalisation: the reference jumps with it, so nothing is
   corrected.  Without a pose for more than half a second, both are reset.
 
+A robot that cannot drive sideways is steered towards its path: what the loop of the position asks for across the motion
+is the heading that the loop of the heading aims for, and only the yaw rate is corrected.
+
 Within the backlash a correction has no effect: with a proportional gain alone up to ``backlash / (k L)`` of
 heading error remains; the integral removes it within a few metres.  Integral and backlash together give a
 slow limit cycle; a proportional gain that is large beside it keeps that to milliradians, and to some
@@ -41,6 +44,7 @@ from scipy.linalg import expm
 from terrain.angles import wrapped
 from terrain.control.pid import LONGEST_STEP_S, Gains, pid_step
 from terrain.control.stability import DELAY_S, SAMPLE_TIME_S, closed_loop
+from terrain.control.turning import SETTINGS as TURN
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
@@ -48,10 +52,11 @@ from terrain.status import StatusCode
 
 MOVING_MPS = 0.05  #: From this speed on a motion has a direction.
 N_SPEEDS = 12
+FASTEST_MPS = 3.0  #: Up to which a loop is checked where the motors' limit is not known.
 
 
 class TrackSettings(NamedTuple):
-    """Gains and limits of path tracking; tuned on simulated drives whose seeds are used nowhere else."""
+    """Gains and limits of path tracking, of a swerve robot; tuned on simulated drives with seeds of their own."""
 
     #: L; half the wheelbase, so that a correction of the heading is that angle of the steering
     arm_m: float = 0.5075
@@ -69,9 +74,29 @@ class TrackSettings(NamedTuple):
     #: a heading that is less certain is not used; it is compared with changes of the heading, which are known better
     yaw_std_max_rad: float = 0.1
     stale_max_s: float = 3.0  #: without a measured speed over ground for longer, the position is not used
+    sideways: bool = True  #: whether a position across the motion is corrected by a speed there
 
 
 SETTINGS = TrackSettings()
+
+
+def tracking_of(robot: Robot) -> TrackSettings:
+    """Return the settings for a robot: of one that cannot drive sideways the position is behind the heading.
+
+    The heading of such a robot follows with the lag of its yaw rate, and its position more slowly, so that the loop of
+    the position has a third of the heading's bandwidth.
+    """
+    settings = SETTINGS._replace(arm_m=robot.wheelbase_m / 2.0, sideways=robot.sideways)
+    if robot.sideways:
+        return settings
+    slower = {"heading_pm": 2.0, "heading_integral_pm2": 0.3, "cross_pm": 0.6, "cross_integral_pm2": 0.06}
+    limits = {
+        "heading_max_rad": 0.6,
+        "cross_max_rad": 0.5,
+        "heading_fastest_ps": 1.5,
+        "cross_fastest_ps": 0.5,
+    }
+    return settings._replace(**slower, **limits)
 
 
 def check_tracking(robot: Robot, settings: TrackSettings = SETTINGS, delay_s: float = DELAY_S) -> None:
@@ -89,8 +114,9 @@ def check_tracking(robot: Robot, settings: TrackSettings = SETTINGS, delay_s: fl
 
         x' = v f,  f' = (s - f) v / sigma,  s' = (u - s) / tau_s,  y' = (x - y) / tau_encoder
 
-    ``tau_s`` is half the time in which the steering's acceleration crosses its backlash.  The position
-    follows the heading and not the reverse, so the loops are checked one by one.  Backlash is not modelled.
+    ``tau_s`` is half the time in which the steering's acceleration crosses its backlash; without steered wheels it
+    is the lag of the yaw rate.  The position follows the heading and not the reverse, so the loops are checked one
+    by one.  Backlash is not modelled.
     With the default delay and integral, AgriMaRo's heading is stable up to a bandwidth of 9 rad/s; 3 is set.
 
     Examples
@@ -104,7 +130,7 @@ def check_tracking(robot: Robot, settings: TrackSettings = SETTINGS, delay_s: fl
     """
     if not 0.0 <= delay_s <= LONGEST_STEP_S:
         raise ConfigError(f"path tracking: delay_s is {delay_s!r}, 0 to {LONGEST_STEP_S:g} s is required")
-    fastest_mps = robot.wheel_radius_m * robot.motors.speed_max_radps
+    fastest_mps = min(robot.wheel_radius_m * robot.completed.motors.speed_max_radps, FASTEST_MPS)
     speeds_mps = np.geomspace(MOVING_MPS, fastest_mps, N_SPEEDS).tolist()
     for loop, (k, k_i, _, fastest_ps) in _loops(settings).items():
         gains = k, k_i, fastest_ps
@@ -128,13 +154,14 @@ def _loops(settings: TrackSettings) -> dict[str, tuple[float, float, float, floa
 
 def _loop_matrix(robot: Robot, gains: tuple[float, float, float], delay_s: float, speed_mps: float) -> Array:
     """Return the loop from sample to sample: x, f, s, y, the integral, the delayed commands."""
-    body, steering, sensors = robot.body, robot.steering, robot.sensors
-    dt_s = SAMPLE_TIME_S
+    body, sensors, dt_s = robot.completed.body, robot.completed.sensors, SAMPLE_TIME_S
+    steering_s = TURN.lag_s
+    if robot.describes("steering"):
+        steering_s = max(math.sqrt(robot.steering.dead_band_rad / robot.steering.accel_max_radps2), 1e-3)
     n_delayed = max(math.ceil(delay_s / dt_s - 1e-9), 1)
     plant = np.zeros((5, 5))  # the fifth is the command, held
     plant[0, 1] = speed_mps
-    plant[1, [2, 1]] = np.array([1.0, -1.0]) * speed_mps / body.relaxation_length_m
-    steering_s = max(math.sqrt(steering.dead_band_rad / steering.accel_max_radps2), 1e-3)
+    plant[1, [2, 1]] = np.array([1.0, -1.0]) * speed_mps / max(body.relaxation_length_m, 1e-3)
     plant[2, [4, 2]] = np.array([1.0, -1.0]) / steering_s
     plant[3, [0, 3]] = np.array([1.0, -1.0]) / max(sensors.encoder_time_constant_s, 1e-3)
     over = expm(plant * dt_s)
@@ -277,14 +304,17 @@ def track_step(
     error = _across(metres * _seen_from(reference, pose, pose[2]), along)
     loops, added, integrals, status = _loops(settings), [], [], TrackStatus.OK
     for value, before, loop in zip(error.tolist(), integral, ("cross", "cross", "heading"), strict=True):
+        off = value
+        if loop == "heading" and not settings.sideways:  # towards the path
+            off -= settings.arm_m * float(along[0]) * added[1]
         k, k_i, limit, fastest = loops[loop]
         slower = min(1.0, fastest / max(k * size, 1e-9))
         gains, distance_m = Gains(slower * k, slower * k_i, limit, limit), min(size * dt_s, LONGEST_STEP_S)
-        one, grown, is_clamped = pid_step(gains, before, -value, distance_m)
+        one, grown, is_clamped = pid_step(gains, before, -off, distance_m)
         added.append(one)
         integrals.append(grown)
         status = TrackStatus.CLAMPED if is_clamped else status
-    correction = _across(np.array(added), along)
+    correction = _across(np.array(added), along) if settings.sideways else np.array([0.0, 0.0, added[2]])
     cross_m = math.copysign(math.hypot(error[0], error[1]), along[0] * error[1] - along[1] * error[0])
     angle = math.sqrt(correction @ correction)
     report = TrackReport(float(error[2]) / settings.arm_m, cross_m, angle, status)

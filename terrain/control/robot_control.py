@@ -1,8 +1,11 @@
-"""Commands of a swerve robot from its desired twist, what is estimated of its motion, and the believed terrain.
+"""Commands of a robot of any drive from its desired twist, what is estimated of its motion, and the believed terrain.
 
 ::
 
-    twist -> path tracking -> kinematics -> wheel controller, with the slips that the terrain's entry aims for
+    twist -> path tracking -> turn -> kinematics -> wheel controller, with the slips that the terrain's entry aims for
+
+Slip is controlled at each driven wheel: of a robot that skids at each side, of a car-like one at its driven axle.
+A robot that turns by the speeds of its wheels keeps its yaw rate (:mod:`terrain.control.turning`).
 
 Braking by controlled slip is aimed for where it stops a robot sooner than locked wheels.  On terrain that
 shears, thrust rises with slip up to the locked wheel: nothing stops sooner.  On hard terrain it falls again
@@ -24,17 +27,23 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.path_tracking import SETTINGS as TRACKING
-from terrain.control.path_tracking import TrackReport, TrackState, TrackStatus, check_tracking, track_step
+from terrain.control.path_tracking import (
+    TrackReport,
+    TrackState,
+    TrackStatus,
+    check_tracking,
+    track_step,
+    tracking_of,
+)
 from terrain.control.pid import LONGEST_STEP_S, DriveState, Gains, WheelPid, wheel_step
 from terrain.control.slip_table import DRIVE_STATES, CurveEntry, SlipTable
-from terrain.control.stability import check_stable
+from terrain.control.stability import check_stable, gain_margin
 from terrain.control.switching import SWITCHING, OutputStatus, TerrainBelief, approach, drive_on
 from terrain.control.traction import (
     TractionState,
@@ -45,22 +54,39 @@ from terrain.control.traction import (
     settings_of,
     traction_step,
 )
+from terrain.control.turning import SETTINGS as TURN
+from terrain.control.turning import first_state, turn_step, turning_of
 from terrain.errors import ConfigError
+from terrain.estimation.clocks import check_channels
 from terrain.estimation.health import SENSORS, SLIP_SENSORS, SOUND, Health
-from terrain.estimation.live import LiveEstimate
-from terrain.kinematics.commands import wheel_command_step
+from terrain.estimation.live import CHANNELS, LiveEstimate
+from terrain.kinematics.commands import wheel_motion
 from terrain.kinematics.wheels import in_wheel_frame, point_velocity
-from terrain.logs.schema import IMU_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Command, Reading
-from terrain.robots import Robot, SwerveRobot, as_drive
-from terrain.slip import MIN_SPEED_MPS
+from terrain.robots import BicycleRobot, Robot
+from terrain.slip import MIN_SPEED_MPS, slip_ratio
 
 #: Commands of the kinematics; with a bounded rise of speed; the thesis' PID on each wheel; the controller of
 #: :mod:`terrain.control.traction`.
 CONTROLLERS = ("plain", "ramp", "thesis", "traction")
 OPEN_LOOP = ("plain", "ramp")  #: Controllers that use no measurement.
-#: The thesis specifies none; these have a gain margin of 3 on the simulated robot (``check_stable``).
-THESIS_GAINS = Gains(0.5, 0.5, limit=2.0)
+#: The thesis specifies none; these have a gain margin of 3 on the simulated robot (``check_stable``). On a robot where
+#: it would be less than the last, they are reduced to 3.
+THESIS_GAINS, LEAST_MARGIN = Gains(0.5, 0.5, limit=2.0), 2.5
+
+
+def thesis_gains(robot: Robot) -> Gains:
+    """Return the gains of the thesis' controller on a robot.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> [round(thesis_gains(load_robot(name)).kp, 2) for name in ("agrimaro", "husky")]
+    [0.5, 0.12]
+    """
+    margin = gain_margin(robot, THESIS_GAINS)
+    factor = 1.0 if margin > LEAST_MARGIN else margin / 3.0
+    return THESIS_GAINS._replace(kp=factor * THESIS_GAINS.kp, ki=factor * THESIS_GAINS.ki)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,21 +104,19 @@ class PilotSettings:
 DEFAULT_SETTINGS = PilotSettings()
 
 
-def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> SwerveRobot:
-    """Return a robot that can be driven; ``ConfigError`` as a pilot, but for path tracking."""
+def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> None:
+    """Raise ``ConfigError`` as a pilot, but for path tracking."""
     if settings.controller not in CONTROLLERS:
         raise ConfigError(
             f"controller {settings.controller!r} is unknown: use one of {', '.join(CONTROLLERS)}"
         )
-    swerve = as_drive(SwerveRobot, robot, "robot {name}: drive {drive!r} has no pilot, only 'swerve' has")
     if not 0.0 < settings.ramp_mps2 < math.inf:
         raise ConfigError(f"ramp_mps2 is {settings.ramp_mps2!r}, a number above zero is required")
     check_table(table, robot.name)
     if settings.track and settings.controller in OPEN_LOOP:
         raise ConfigError(f"controller {settings.controller!r} estimates no pose: it has no path tracking")
     if settings.controller == "thesis":
-        check_stable(swerve, THESIS_GAINS, settings.delay_s)
-    return swerve
+        check_stable(robot, thesis_gains(robot), settings.delay_s)
 
 
 def check_table(table: SlipTable, robot: str) -> None:
@@ -109,42 +133,57 @@ def step_or_period(dt_s: float) -> float:
     return dt_s if 0.0 < dt_s <= LONGEST_STEP_S else PERIOD_S
 
 
-_UNKNOWN = np.full(3, math.nan)
-#: Before the first estimate.
-UNOBSERVED = WheelMotion(_UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN, math.nan, math.inf)
+def unobserved(n: int) -> WheelMotion:
+    """Return the motion of n wheels before the first estimate."""
+    unknown = np.full(n, math.nan)
+    return WheelMotion(unknown, unknown, unknown, unknown, unknown, unknown, math.nan, math.inf)
 
 
 def observe_wheels(
-    robot: Robot, steer_states: Array, estimate: LiveEstimate | None, time_s: float
+    robot: Robot, steer_rad: Array, estimate: LiveEstimate | None, time_s: float, track_ratio: float = 1.0
 ) -> WheelMotion:
-    """Return the motion along each wheel from an estimate of the robot's motion; NaN before the first one.
+    """Return the motion along each driven wheel from an estimate of the robot's motion; NaN before the first one.
 
-    ``steer_states`` (wheels,) are the places of the steering angles among the estimate's states.
+    ``steer_rad`` (wheels,) are the angles of the steering, 0 without.  Of a robot that skids, ``track_ratio`` is its
+    effective track over its track: its slip is counted beyond what turning takes.
     """
+    n = len(robot.wheels)
     if estimate is None:
-        return UNOBSERVED
-    motors, stale_s, steer_rad = (
-        robot.motors,
-        estimate_age(estimate, time_s),
-        estimate.mean[steer_states],
-    )
-    cos, sin, (x_m, y_m) = np.cos(steer_rad), np.sin(steer_rad), np.transpose(robot.wheel_positions_m)
-    motion = estimate.speed_x_mps, estimate.speed_y_mps, estimate.yaw_rate_radps
-    speed, _ = in_wheel_frame(*point_velocity(*motion, x_m, y_m), cos, sin)
+        return unobserved(len(robot.logged_wheels))
+    motors, stale_s = robot.completed.motors, estimate_age(estimate, time_s)
+    rollers, (x_m, y_m) = robot.roller_angles_rad, np.transpose(robot.wheel_positions_m)
+    angle = steer_rad + robot.wheel_directions_rad + rollers
+    along = np.cos(angle) / np.cos(rollers), np.sin(angle) / np.cos(rollers)
+    ahead, left, turn = estimate.speed_x_mps, estimate.speed_y_mps, track_ratio * estimate.yaw_rate_radps
+    left = left if robot.sideways else 0.0  # sideways it goes as it is pushed
+    if isinstance(robot, BicycleRobot) and math.isnan(turn):
+        turn = ahead * math.tan(steer_rad[0]) / robot.wheelbase_m
+    speed, _ = in_wheel_frame(*point_velocity(ahead, left, turn, x_m, y_m), *along)
     wheel, slip = np.abs(estimate.wheel_speed_mps), estimate.slip_ratio
+    if robot.skids:
+        beyond = slip_ratio(estimate.wheel_speed_mps, speed)
+        slip = np.where(np.isnan(slip), slip, beyond)
     fastest = np.where(wheel <= np.abs(speed), np.abs(speed), wheel)  # NaN too
     # a wheel stands by the filter's rate, which differs a little from the measured one
     standing = fastest < np.where(np.isnan(slip), 2.0, 1.0) * MIN_SPEED_MPS
-    return WheelMotion(
+    accel = (np.nan_to_num(one) for one in (estimate.accel_x_mps2, estimate.accel_y_mps2))
+    accel_x, accel_y = (float(one) for one in accel)
+    torque_nm = np.full(n, math.nan)
+    if robot.describes("motors"):
+        torque_nm = estimate.current_a * (
+            motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
+        )
+    rows = (
         speed,
-        estimate.accel_x_mps2 * cos + estimate.accel_y_mps2 * sin,
+        accel_x * along[0] + accel_y * along[1],
         np.where(standing & (stale_s < math.inf), 0.0, slip),
         np.where(standing, 0.0, estimate.slip_std),
-        estimate.current_a * (motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio),
-        wheel_radps=estimate.wheel_speed_mps / robot.wheel_radius_m,
-        chassis_mps=math.hypot(estimate.speed_x_mps, estimate.speed_y_mps),
-        stale_s=stale_s,
+        torque_nm,
+        estimate.wheel_speed_mps / robot.wheel_radius_m,
     )
+    driven = np.isin(robot.wheels, robot.logged_wheels)
+    speeds = (one for one in (estimate.speed_x_mps, estimate.speed_y_mps) if math.isfinite(one))
+    return WheelMotion(*(row[driven] for row in rows), chassis_mps=math.hypot(*speeds), stale_s=stale_s)
 
 
 def largest_forward(wheel_radps: Array, slip_ratio: Array) -> float:
@@ -221,34 +260,34 @@ SLOW_S, APPROACH = 0.2, 0.02
 SPEED_MPS, SPEED_RATIO, STEER_RAD = 0.05, 0.06, 0.06
 
 
-_TOLERANCE, _RATIO = np.repeat([SPEED_MPS, STEER_RAD], 3), np.repeat([SPEED_RATIO, 0.0], 3)
-_STILL_S = np.repeat([STILL_S, math.inf], 3)  # a steering angle may repeat itself
-
-
 class Actuation:
-    """Wheels and steering of a robot against their commands, step by step: which (6,) are ``off``.
+    """Wheels and steering of a robot against their commands, step by step: which (wheels + angles,) are ``off``.
 
-    ``mps_per_radps`` is the speed of a wheel by the rate of its motor.
+    ``mps_per_rate`` is the speed of a wheel by what its channel holds, the rate of its motor or the speed itself.
     """
 
-    def __init__(self, mps_per_radps: float) -> None:
-        self._mps_per_radps, self._command = mps_per_radps, np.full(6, math.nan)
+    def __init__(self, mps_per_rate: float, n_wheels: int = 3, n_angles: int = 3) -> None:
+        self._mps_per_rate, self._n, n = mps_per_rate, n_wheels, (n_wheels, n_angles)
+        self._tolerance, self._ratio = np.repeat([SPEED_MPS, STEER_RAD], n), np.repeat([SPEED_RATIO, 0.0], n)
+        self._still_s = np.repeat([STILL_S, math.inf], n)  # a steering angle may repeat itself
+        size = sum(n)
+        self._command = np.full(size, math.nan)
         self._commands: deque[tuple[float, Array]] = deque(maxlen=N_COMMANDS)
-        self._last = self._before = self._smooth = self._slow = np.full(6, math.nan)
-        self._repeated_s, self._off_s, self._on_s = np.zeros(6), np.zeros(6), np.full(6, SETTLED_S)
-        self.off = np.zeros(6, dtype=np.bool_)
+        self._last = self._before = self._smooth = self._slow = np.full(size, math.nan)
+        self._repeated_s, self._off_s, self._on_s = np.zeros(size), np.zeros(size), np.full(size, SETTLED_S)
+        self.off = np.zeros(size, dtype=np.bool_)
 
     def commanded(self, wheel_mps: Array, steer_rad: Array) -> None:
-        """Take the commands (3,), (3,) that are in force from now on."""
+        """Take the commands (wheels,), (angles,) that are in force from now on."""
         self._command = np.concatenate([wheel_mps, steer_rad])
 
     def measured(self, now_s: float, step_s: float, wheels: Reading | None, steer_rad: Array | None) -> None:
-        """Compare the rates, first columns of the wheels, and steering angles (3,) with the commands."""
-        value = np.full(6, math.nan)
+        """Compare the rates, first columns of the wheels, and steering angles (angles,) with the commands."""
+        value, n = np.full(len(self._command), math.nan), self._n
         if wheels is not None:
-            value[:3] = wheels.values[-1, :3] * self._mps_per_radps
+            value[:n] = wheels.values[-1, :n] * self._mps_per_rate
         if steer_rad is not None:
-            value[3:] = steer_rad
+            value[n:] = steer_rad
         last_three = np.array([value, self._last, self._before])
         middle = np.where(np.isnan(last_three).any(axis=0), value, np.sort(last_three, axis=0)[1])
         self._repeated_s = np.where(value == self._last, self._repeated_s + step_s, 0.0)
@@ -260,12 +299,12 @@ class Actuation:
         ]
         self._commands.append((now_s, self._command))
         commands = np.array([command for _, command in self._commands])
-        since_s = now_s - np.where(self._repeated_s >= _STILL_S, STILL_S, WINDOW_S)
+        since_s = now_s - np.where(self._repeated_s >= self._still_s, STILL_S, WINDOW_S)
         counts = (np.array([[time_s] for time_s, _ in self._commands]) >= since_s) & ~np.isnan(commands)
         known = counts.any(axis=0)
         low = np.where(known, np.where(counts, commands, math.inf).min(axis=0), 0.0)
         high = np.where(known, np.where(counts, commands, -math.inf).max(axis=0), 0.0)
-        slack = _TOLERANCE + _RATIO * np.maximum(np.abs(low), np.abs(high))
+        slack = self._tolerance + self._ratio * np.maximum(np.abs(low), np.abs(high))
         below, above = known & (smooth < low - slack), known & (smooth > high + slack)
         goes = ~((below & (smooth > slow + APPROACH)) | (above & (smooth < slow - APPROACH)))
         deviates = below | above
@@ -275,12 +314,11 @@ class Actuation:
         self.off = np.where(goes, now_off, self.off)
 
 
-_ROLL, _PITCH = IMU_CHANNELS.index("roll_rad"), IMU_CHANNELS.index("pitch_rad")
 _OF_SLIP = tuple(SENSORS.index(name) for name in SLIP_SENSORS)
 # Order in which sensors are named, by health: one that steps or freezes takes others with it, which are lost.
 _NAMED_FIRST = (0, 1, 2, 3, 4, 6, 7, 5)
 _GYRO, _SEEN, _SEEN_YAW = (SENSORS.index(name) for name in ("gyro", "camera_speed", "camera_yaw"))
-_NOT_ESTIMATED = UNOBSERVED._replace(stale_s=math.nan)
+POSE_STATES = ("position_x_m", "position_y_m", "yaw_rad")  #: Of a filter that path tracking is built on.
 _NOT_TRACKED = TrackReport(math.nan, math.nan, 0.0, TrackStatus.NO_POSE)
 
 
@@ -289,10 +327,11 @@ class RobotControl:
 
     Parameters
     ----------
-    robot : corrected, with all sections
+    robot : corrected; a swerve robot with all sections
     table : target slips
     settings : as :func:`check_pilot` accepts them
     states : of the filter that estimates the motion; none for a controller that uses no measurement
+    channels : of each stream that is measured, in the order of the columns; those of a swerve robot by default
 
     Attributes
     ----------
@@ -302,30 +341,52 @@ class RobotControl:
     Raises
     ------
     ConfigError
-        if path tracking is unstable on the robot, with its delay.
+        if path tracking is unstable on the robot, with its delay, or the wheels' channels are not among those given.
     """
 
     def __init__(
-        self, robot: SwerveRobot, table: SlipTable, settings: PilotSettings, states: Sequence[str]
+        self,
+        robot: Robot,
+        table: SlipTable,
+        settings: PilotSettings,
+        states: Sequence[str],
+        channels: Mapping[str, Sequence[str]] = CHANNELS,
     ) -> None:
         self._robot, self._settings, self._estimates = robot, settings, bool(states)
-        self._radius_m, self._positions_m = robot.wheel_radius_m, np.array(robot.wheel_positions_m)
-        motors, steering = robot.motors, robot.steering
-        self._limits = robot.wheel_radius_m, motors.speed_max_radps, steering.rate_max_radps
-        self._traction = settings_of(robot)
+        self._radius_m, self._driven = robot.wheel_radius_m, np.isin(robot.wheels, robot.logged_wheels)
+        self._traction, self._track_settings = settings_of(robot), tracking_of(robot)
+        # angles that the filter estimates; those of others are where they are commanded
+        self._angles = [f"steer_{i}_rad" for i in robot.steered_wheels]
+        self._angles = self._angles if set(self._angles) <= set(states) else []
+        self._steer_states = np.array([states.index(angle) for angle in self._angles], int)
+        self._pose_states = [states.index(state) for state in POSE_STATES if state in states]
+        if states and settings.track:
+            if len(self._pose_states) < len(POSE_STATES):
+                raise ConfigError(
+                    f"robot {robot.name}: its filter estimates no pose: leave path tracking out"
+                )
+            check_tracking(robot, self._track_settings, settings.delay_s)
+        n, mps_per_rate = len(robot.logged_wheels), 1.0
+        if robot.by_motor:
+            mps_per_rate = robot.wheel_radius_m / robot.completed.motors.reduction_ratio
+        self._actuation = Actuation(mps_per_rate, n, len(self._angles))
+        wheels, imu = (list(channels.get(name, ())) for name in ("wheels", "imu"))
         if states:
-            self._steer_states = np.array([states.index(f"steer_{i}_rad") for i in robot.wheels])
-            self._pose_states = [states.index(state) for state in ("position_x_m", "position_y_m", "yaw_rad")]
-            if settings.track:
-                check_tracking(robot, TRACKING, settings.delay_s)
-        self._actuation = Actuation(robot.wheel_radius_m / motors.reduction_ratio)
+            check_channels("wheels", robot.rate_channels, wheels)
+        self._n_columns = len(wheels), len(imu)
+        self._rates = [wheels.index(channel) for channel in robot.rate_channels if states]
+        self._tilt = [imu.index(angle) for angle in ("roll_rad", "pitch_rad") if angle in imu]
+        self._gains = thesis_gains(robot) if settings.controller == "thesis" else THESIS_GAINS
+        self._turning = None
+        if settings.controller == "traction" and not robot.steered:
+            self._turning = turning_of(robot)
         self.use(table)
         # what a step leaves to the next
         self.health = [0] * len(SENSORS)
-        self.steer_rad = np.zeros(3)
+        self.steer_rad = np.zeros(len(robot.wheels))
         self.target_ratio, self._tilt_rad, self._tracking = math.nan, (0.0, 0.0), TrackState()
-        self._state, self._pids = TractionState(), [WheelPid()] * len(robot.wheels)
-        self._wheel_radps, self._driven_mps = np.zeros(3), 0.0
+        self._state, self._pids, self._turn = TractionState(), [WheelPid()] * n, first_state(robot)
+        self._wheel_radps, self._driven_mps, self._driven_part = np.zeros(n), 0.0, 1.0
 
     def use(self, table: SlipTable) -> None:
         """Aim for the targets of a table from now on."""
@@ -344,22 +405,25 @@ class RobotControl:
 
         Rates of motors that do not follow their commands are not to be believed: they are replaced by NaN.
         """
-        imu = readings.get("imu")
-        if imu is not None and imu.values.shape[1] == len(IMU_CHANNELS) and len(imu.values):
-            roll, pitch = float(imu.values[-1, _ROLL]), float(imu.values[-1, _PITCH])
+        wheels, imu = (
+            reading
+            if reading is not None and len(values := reading.values) and values.shape[1] == n
+            else None
+            for reading, n in zip(map(readings.get, ("wheels", "imu")), self._n_columns, strict=True)
+        )
+        if imu is not None and len(self._tilt) == 2:
+            roll, pitch = imu.values[-1, self._tilt].tolist()
             if math.isfinite(roll) and math.isfinite(pitch):
                 self._tilt_rad = roll, pitch
         if not self._settings.follows:
             return
-        wheels = readings.get("wheels")
-        if wheels is not None and (not len(wheels.values) or wheels.values.shape[1] != len(WHEELS_CHANNELS)):
-            wheels = None
+        rates = None if wheels is None else Reading(wheels.time_s, wheels.values[:, self._rates])
         steer_rad = None if seen is None else seen.mean[self._steer_states]
-        self._actuation.measured(time_s, step_or_period(dt_s), wheels, steer_rad)
-        off = self._actuation.off[:3]
+        self._actuation.measured(time_s, step_or_period(dt_s), rates, steer_rad)
+        off = self._actuation.off[: len(self._rates)]
         if wheels is not None and off.any():
             values = wheels.values.copy()
-            values[:, np.flatnonzero(off)] = math.nan
+            values[:, np.array(self._rates)[off]] = math.nan
             readings["wheels"] = Reading(wheels.time_s, values)
 
     def step(
@@ -390,17 +454,23 @@ class RobotControl:
         sensor, health = self._judge(seen)
         target = self._target(belief.terrain, seen, step_s)
         twist, tracked = self._track(desired, seen, time_s, dt_s)
-        admitted, wheel_radps, self.steer_rad = wheel_command_step(
-            self._positions_m, *self._limits, step_s, twist, self.steer_rad
-        )
+        twist = self._keep_turn(twist, seen, sound=health <= SOUND, dt_s=dt_s)
+        admitted, all_radps = self._to_wheels(twist, step_s)
+        wheel_radps = all_radps[self._driven]
         desired_mps = max(map(abs, wheel_radps.tolist())) * self._radius_m
         if not holds:
             belief = drive_on(belief, desired_mps, step_s)
-        observed = _NOT_ESTIMATED
+        observed = unobserved(len(wheel_radps))
         if self._estimates:
-            observed = observe_wheels(self._robot, self._steer_states, seen, time_s)
+            steer_rad = self.steer_rad
+            if self._angles and seen is not None:
+                steer_rad = seen.mean[self._steer_states]
+            ratio = self._turn.track_ratio if self._turning is not None else 1.0
+            observed = observe_wheels(self._robot, steer_rad, seen, time_s, ratio)
+        else:
+            observed = observed._replace(stale_s=math.nan)
         sound = health <= SOUND
-        seen_wheels = observed if sound else UNOBSERVED
+        seen_wheels = observed if sound else unobserved(len(wheel_radps))
         command_radps, done = self._command(
             wheel_radps, desired_mps, seen_wheels, target, belief.terrain, dt_s
         )
@@ -408,7 +478,7 @@ class RobotControl:
         if not sound:
             status = status if status == TractionStatus.BAD_TIME else TractionStatus.UNSOUND
             slip_ratio = largest_forward(wheel_radps, observed.slip_ratio)
-        self._actuation.commanded(command_radps * self._radius_m, self.steer_rad)
+        self._actuation.commanded(command_radps * self._radius_m, self.steer_rad[: len(self._angles)])
         figures = {
             "status_code": float(status),  # of traction.TractionStatus
             "terrain_code": float(self.terrains.get(belief.terrain, -1)),  # in the table; -1 where unknown
@@ -430,7 +500,29 @@ class RobotControl:
             "output_code": float(output),  # of the terrain source, switching.OutputStatus
         }
         scale = done.driven_mps / desired_mps if desired_mps > 0.0 else 0.0
-        return Command(command_radps, self.steer_rad, admitted * scale, figures), belief
+        self._driven_part = min(scale, 1.0) if desired_mps > 0.0 else 1.0
+        all_radps = all_radps * scale  # wheels that are not driven roll along
+        all_radps[self._driven] = command_radps
+        return Command(all_radps, self.steer_rad, admitted * scale, figures), belief
+
+    def _keep_turn(self, twist: Array, seen: LiveEstimate | None, *, sound: bool, dt_s: float) -> Array:
+        """Return the twist for the kinematics with which a robot that turns by its wheels' speeds turns as desired."""
+        if self._turning is None:
+            return twist
+        turn, wheels_mps = math.nan, np.full(len(self._robot.wheels), math.nan)
+        if seen is not None and sound:
+            turn, wheels_mps = seen.yaw_rate_radps, seen.wheel_speed_mps
+        given = twist, self._driven_part, turn, wheels_mps, dt_s
+        twist, self._turn = turn_step(TURN, self._turning, self._turn, *given)
+        return twist
+
+    def _to_wheels(self, twist: Array, dt_s: float) -> tuple[Array, Array]:
+        """Steer; return the twist that the wheels can drive, and their rates (wheels,)."""
+        found = wheel_motion(self._robot, twist[None], dt_s, self.steer_rad)
+        # a car-like robot that stops rolls on as it is steered
+        if twist.any() or not isinstance(self._robot, BicycleRobot):
+            self.steer_rad = found.steer_rad[0]
+        return found.twist[0], found.wheel_radps[0]
 
     def _command(
         self,
@@ -458,11 +550,16 @@ class RobotControl:
             return command, WheelReport(driven_mps, *unknown, DriveState.STEADY, TractionStatus.OK)
         by_state, stale = self._table.lookup(terrain), seen.stale_s > self._traction.stale_max_s
         targets = [by_state[state].slip_ratio for state in DRIVE_STATES]
-        columns = (wheel_radps, seen.wheel_radps, _UNKNOWN if stale else seen.speed_mps, seen.accel_mps2)
+        columns = (
+            wheel_radps,
+            seen.wheel_radps,
+            seen.speed_mps * (math.nan if stale else 1.0),
+            seen.accel_mps2,
+        )
         rows, chassis_mps, wheels = (column.tolist() for column in columns), seen.chassis_mps, []
         for i, (rate, measured, speed, accel) in enumerate(zip(*rows, strict=True)):
             given = rate, measured, speed, accel, chassis_mps, targets, dt_s
-            wheel, self._pids[i] = wheel_step(THESIS_GAINS, radius_m, self._pids[i], *given)
+            wheel, self._pids[i] = wheel_step(self._gains, radius_m, self._pids[i], *given)
             wheels.append(wheel)
         desired = np.array([one.desired_ratio for one in wheels])
         status = TractionStatus.OK if np.isfinite(desired).all() else TractionStatus.NO_SLIP
@@ -481,6 +578,8 @@ class RobotControl:
             self.health = [int(Health.LOST)] * len(SENSORS)
             return 0, Health.LOST
         self.health = health = seen.health.tolist()
+        if len(health) != len(SENSORS):  # of other drives only wheels that do not follow are known
+            return -1, Health.DISAGREES if self._actuation.off.any() else Health.FRESH
         for i in np.flatnonzero(self._actuation.off).tolist():
             if health[i] == Health.LOST or health[i] < Health.DISAGREES:  # it was taken from the filter
                 health[i] = int(Health.DISAGREES)
@@ -509,14 +608,18 @@ class RobotControl:
         """
         if not self._settings.track or seen is None:
             return twist, _NOT_TRACKED
-        turns, seen_yaw, camera = (self.health[i] for i in (_GYRO, _SEEN_YAW, _SEEN))
-        is_sound = min(turns, seen_yaw) <= SOUND and (camera <= SOUND or camera == Health.LOST)
+        is_sound = True
+        if len(self.health) == len(SENSORS):
+            turns, seen_yaw, camera = (self.health[i] for i in (_GYRO, _SEEN_YAW, _SEEN))
+            is_sound = min(turns, seen_yaw) <= SOUND and (camera <= SOUND or camera == Health.LOST)
+        ahead, left, yaw = seen.speed_x_mps, seen.speed_y_mps, seen.yaw_rate_radps
+        left = left if self._robot.sideways else 0.0
         twist, self._tracking, report = track_step(
-            TRACKING,
+            self._track_settings,
             self._tracking,
             twist,
             seen.mean[self._pose_states],
-            np.array([seen.speed_x_mps, seen.speed_y_mps, seen.yaw_rate_radps]),
+            np.array([ahead, left, yaw]),
             float(seen.std[self._pose_states[2]]) if is_sound else math.inf,
             estimate_age(seen, time_s),
             dt_s,

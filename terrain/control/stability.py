@@ -1,13 +1,13 @@
 """Stability of a slip controller on a robot: its sampled loop, linearised, over the range of operation.
 
-Small changes about steady rolling of one wheel that carries a third of the robot, with rate w, ground speed
-v, ``V = max(w r, v)``, slip s, the slip k that the contact has built up over its relaxation length, torque T,
-the PI loop of the motor driver (q its integral, e its estimate of w, g its gains) and y, the estimated slip
-that the controller uses::
+Small changes about steady rolling of a driven wheel that carries its part m of the robot's mass, with rate w,
+ground speed v, ``V = max(w r, v)``, slip s, the slip k that the contact has built up over its relaxation length,
+torque T, the PI loop of the motor driver (q its integral, e its estimate of w, g its gains) and y, the estimated
+slip that the controller uses::
 
     s = (r (1 - s_0) w - v) / V  (traction)   or   (r w - (1 + s_0) v) / V  (braking)
     k' = (s - k) V / sigma                    thrust F = c (k + damping k')
-    J w' = T - r F,   (m / 3) v' = F          T' = (g_P (u - e) + q - T) / tau_T,  q' = g_I (u - e)
+    J w' = T - r F,   m v' = F                T' = (g_P (u - e) + q - T) / tau_T,  q' = g_I (u - e)
     e' = (w - e) / tau_e                      y' = (s - y) / tau_encoder
 
 The controller gives its output u once in a sample time, after a delay (whole samples, rounded up), and
@@ -56,6 +56,11 @@ SLOPES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 LARGEST_FACTOR = 1e3  #: A larger gain margin is given as infinite.
 
 
+def gain_margin(robot: Robot, gains: Gains, delay_s: float = DELAY_S) -> float:
+    """Return the factor of :func:`check_stable`, below 1 where the loop is unstable."""
+    return _margin(robot, gains, delay_s)[0]
+
+
 def check_stable(robot: Robot, gains: Gains, delay_s: float = DELAY_S) -> float:
     """Return the factor on all gains at which the loop becomes unstable somewhere in the robot's range of operation.
 
@@ -74,7 +79,19 @@ def check_stable(robot: Robot, gains: Gains, delay_s: float = DELAY_S) -> float:
     terrain.errors.ConfigError: robot agrimaro: slip control (kp 2, ki 0) with a delay of 0.05 s is
     unstable from 0.05 to 2 m/s; it is stable up to 0.76 times these gains
     """
-    robot.require("body", "motors", "steering", "sensors")
+    margin, unstable = _margin(robot, gains, delay_s)
+    if unstable:
+        raise ConfigError(
+            f"robot {robot.name}: slip control (kp {gains.kp:g}, ki {gains.ki:g}) "
+            f"with a delay of {delay_s:g} s is unstable from {min(unstable):.3g} to {max(unstable):.3g} m/s; "
+            f"it is stable up to {margin:.2g} times these gains"
+        )
+    return margin
+
+
+def _margin(robot: Robot, gains: Gains, delay_s: float) -> tuple[float, list[float]]:
+    """Return the factor on the gains up to which the loop is stable, and speeds at which it is not as it is."""
+    robot.require("body", "motors", "sensors")
     fastest_mps = robot.wheel_radius_m * robot.motors.speed_max_radps
     speeds_mps = np.geomspace(LOW_SPEED_MPS, fastest_mps, N_SPEEDS).tolist()
     places = list(product(speeds_mps, SLIPS, SLOPES))
@@ -91,14 +108,7 @@ def check_stable(robot: Robot, gains: Gains, delay_s: float = DELAY_S) -> float:
     while high / margin > 1.003:
         middle = math.sqrt(margin * high)
         margin, high = (middle, high) if radii(middle).max() < 1.0 else (margin, middle)
-    unstable = [place[0] for place, radius in zip(places, radii(1.0), strict=True) if radius >= 1.0]
-    if unstable:
-        raise ConfigError(
-            f"robot {robot.name}: slip control (kp {gains.kp:g}, ki {gains.ki:g}) "
-            f"with a delay of {delay_s:g} s is unstable from {min(unstable):.3g} to {max(unstable):.3g} m/s; "
-            f"it is stable up to {margin:.2g} times these gains"
-        )
-    return margin
+    return margin, [place[0] for place, radius in zip(places, radii(1.0), strict=True) if radius >= 1.0]
 
 
 def loop_matrices(
@@ -116,7 +126,12 @@ def loop_matrices(
         raise ConfigError(f"delay_s is {delay_s!r}, 0 to {LONGEST_DELAY_S:g} s is required")
     dt_s, radius_m = SAMPLE_TIME_S, robot.wheel_radius_m
     n_delayed = math.ceil(delay_s / dt_s - 1e-9)
-    body, motors, sensors, third_kg = robot.body, robot.motors, robot.sensors, robot.mass_kg / 3
+    body, motors, sensors, part_kg = (
+        robot.body,
+        robot.motors,
+        robot.sensors,
+        robot.mass_kg / len(robot.logged_wheels),
+    )
     rate, speed, contact, torque, q, estimate, measured, command = np.eye(8)  # w, v, k, T, q, e, y, u
     lags_s = motors.torque_time_constant_s, motors.speed_estimate_time_constant_s
     torque_s, estimate_s = (max(lag_s, STEP_S) for lag_s in lags_s)  # as in the simulator
@@ -126,11 +141,11 @@ def loop_matrices(
         by_wheel, by_robot = (1 - slip_ratio, 1.0) if slip_ratio > 0 else (1.0, 1 + slip_ratio)
         slip = (radius_m * by_wheel * rate - by_robot * speed) / speed_mps
         build_up = (slip - contact) * speed_mps / body.relaxation_length_m
-        thrust = slope_ratio * third_kg * GRAVITY_MPS2 * (contact + DEFLECTION_DAMPING_S * build_up)
+        thrust = slope_ratio * part_kg * GRAVITY_MPS2 * (contact + DEFLECTION_DAMPING_S * build_up)
         speed_error = command - estimate
         rows = (
             (torque - radius_m * thrust) / body.wheel_inertia_kgm2,
-            thrust / third_kg,
+            thrust / part_kg,
             build_up,
             (motors.speed_gain_nmspr * speed_error + q - torque) / torque_s,
             motors.speed_integral_nmpr * speed_error,

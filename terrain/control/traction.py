@@ -106,8 +106,9 @@ def settings_of(robot: Robot) -> TractionSettings:
     """Return the settings, with what a robot's motor drivers need to change their torque.
 
     A PI speed loop carries a change of torque T by its error until its integral has taken it over: an error
-    of ``T / K_P`` with the time constant ``K_P / K_I``.  At a deceleration a, each of n wheels carries
-    ``T = a m r / n``.
+    of ``T / K_P`` with the time constant ``K_P / K_I``.  At a deceleration a, each of n driven wheels carries
+    ``T = a m r / n``; without known motors nothing is added.  Wheels are steered against each other by an error of
+    their angles: where they are not, they turn the robot by their difference in torque, and none droops.
 
     Examples
     --------
@@ -115,10 +116,14 @@ def settings_of(robot: Robot) -> TractionSettings:
     >>> round(settings_of(load_robot("agrimaro")).charge_mps_per_mps2, 3)
     0.1
     """
-    motors = robot.motors
-    torque = robot.mass_kg * robot.wheel_radius_m / len(robot.wheels)
+    settings = SETTINGS
+    if not (robot.steered and robot.sideways):
+        settings = settings._replace(droop_radps_per_nm=0.0)
+    motors, torque = robot.completed.motors, robot.mass_kg * robot.wheel_radius_m / len(robot.logged_wheels)
+    if motors.speed_gain_nmspr == 0.0:
+        return settings
     integral = motors.speed_integral_nmpr
-    return SETTINGS._replace(
+    return settings._replace(
         charge_mps_per_mps2=torque / motors.speed_gain_nmspr * robot.wheel_radius_m,
         charge_time_s=motors.speed_gain_nmspr / integral if integral > 0 else 1e6,
     )
@@ -162,12 +167,8 @@ class TractionState(NamedTuple):
     held_s: float = 0.0  #: for how long d has been limited
     braking_s: float = 0.0  #: for how long braking has been controlled
     braked_from_mps: float = 0.0  #: largest d in it
-    droop_nm: tuple[float, ...] = (0.0, 0.0, 0.0)  #: torque of each wheel behind its low-pass
-    rate_radpm: tuple[float, ...] = (
-        0.0,
-        0.0,
-        0.0,
-    )  #: of each wheel at w = 1 m/s, of the last command to move
+    droop_nm: tuple[float, ...] = ()  #: torque of each wheel behind its low-pass; none yet at first
+    rate_radpm: tuple[float, ...] = ()  #: of each wheel at w = 1 m/s, of the last command to move
 
 
 _SLOW_S = 0.5  # window of the speed gain: shorter is noise, longer comes late
@@ -207,6 +208,8 @@ def traction_step(
     dt_s : since the step before
     """
     rates = wheel_radps.tolist()
+    if not state.rate_radpm:
+        state = state._replace(droop_nm=(0.0,) * len(rates), rate_radpm=(0.0,) * len(rates))
     desired, along = 0.0, 0.0
     for rate, before in zip(rates, state.rate_radpm, strict=True):
         desired = max(desired, abs(rate) * radius_m)

@@ -43,14 +43,15 @@ class WheelMotion(NamedTuple):
     steer_rad: Array  #: (n, wheels) steering angles; 0 without steering
 
 
-def wheel_motion(robot: Robot, twist: Array, dt_s: float) -> WheelMotion:
-    """Return the commands with which a robot drives desired twists, its steering straight at the start.
+def wheel_motion(robot: Robot, twist: Array, dt_s: float, steer_rad: Array | None = None) -> WheelMotion:
+    """Return the commands with which a robot drives desired twists.
 
     Parameters
     ----------
     robot : a swerve robot with motors and steering; other robots without motors have no fastest speed
     twist : (n, 3) desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``
     dt_s : time from one twist to the next
+    steer_rad : (wheels,) of a swerve robot, commanded before; straight by default
 
     Raises
     ------
@@ -82,8 +83,9 @@ def wheel_motion(robot: Robot, twist: Array, dt_s: float) -> WheelMotion:
     if robot.steered:
         motors, steering = robot.motors, robot.steering
         limits = (motors.speed_max_radps, steering.rate_max_radps, dt_s)
+        before = np.zeros(len(robot.wheels)) if steer_rad is None else steer_rad
         admitted, wheel_radps, steers = wheel_commands(
-            robot.wheel_positions_m, radius_m, *limits, np.asarray(twist, float), np.zeros(len(robot.wheels))
+            robot.wheel_positions_m, radius_m, *limits, np.asarray(twist, float), before
         )
         return WheelMotion(admitted, wheel_radps * radius_m, wheel_radps, steers)
     place = robot.wheel_positions_m, robot.wheel_directions_rad, robot.roller_angles_rad
