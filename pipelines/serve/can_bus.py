@@ -31,7 +31,7 @@ from terrain.control.wheel_corrections import BridgeState, LowLevelKinematics, c
 from terrain.errors import ConfigError, one_line
 from terrain.estimation.clocks import SessionClock
 from terrain.records import Array, Sample
-from terrain.robots import SwerveRobot, load_robot
+from terrain.robots import SwerveRobot, as_drive, load_robot
 
 if TYPE_CHECKING:
     from can import Message as Frame
@@ -329,7 +329,8 @@ def run(settings: Settings, progress: Progress = silent) -> BridgeResult:
     interface, channel = bus_of(settings.can or "")
     layout = load_layout(settings.dbc)
     table, pilot = load_slip_table(settings.table), PilotSettings(controller=settings.controller)
-    robot = load_robot(settings.robot or "agrimaro")
+    refusal = "robot {name}: drive {drive!r} has no corrections on a CAN bus, only 'swerve' has"
+    robot = as_drive(SwerveRobot, load_robot(settings.robot or "agrimaro"), refusal)
     check_pilot(robot, table, pilot)
     chain = chain_of(
         robot,

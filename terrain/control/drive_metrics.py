@@ -243,7 +243,7 @@ def adaptation_times(control: Stream, changes: Sequence[tuple[float, float]]) ->
 
 def command_change(commands: Stream) -> float:
     """Return the rms rate of change of the wheels' commands in rad/s^2."""
-    wheels = commands.columns(f"wheel_{i}_radps" for i in (1, 2, 3))
+    wheels = commands.columns(name for name in commands.channels if name.startswith("wheel_"))
     return float(np.sqrt(np.mean((np.diff(wheels, axis=0) / np.diff(commands.time_s)[:, None]) ** 2)))
 
 

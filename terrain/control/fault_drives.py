@@ -326,7 +326,7 @@ class FaultRow:
 
 
 class FaultLoop(NamedTuple):
-    """The closed loop of all drives: a swerve robot, its pilots by controller, and the delay to the wheel."""
+    """The closed loop of all drives: a robot, its pilots by controller, and the delay to the wheel."""
 
     robot: Robot
     new_pilot: Callable[[str], Any]  #: of ``traction`` or ``plain``; is sent to other processes
@@ -403,7 +403,7 @@ def clean_drive(place: Place, references: References) -> dict[str, Any]:
 class GuardedPilot:
     """Passes samples to a pilot; where it fails, the wheels keep their last command.
 
-    Counted are steps at which it raised, or gave a command that is not three finite numbers, with the first exception;
+    Counted are steps at which it raised, or gave a command that is not finite numbers, with the first exception;
     recorded after each step are the estimated forward speed, NaN without one, and the pilot's ``health``, a mapping
     from a sensor to the name of its status, None without one.
     """
@@ -432,7 +432,8 @@ class GuardedPilot:
         if command is not None and self._last is not None:
             try:
                 rows = [np.asarray(row, dtype=np.float64) for row in command[:3]]
-                finite = all(row.shape == (3,) and bool(np.isfinite(row).all()) for row in rows)
+                shapes = [np.shape(row) for row in self._last[:3]]
+                finite = [row.shape for row in rows] == shapes and all(np.isfinite(row).all() for row in rows)
             except (TypeError, ValueError):
                 finite = False
             self.n_not_finite += not finite

@@ -302,7 +302,8 @@ def track_step(
 
     # errors across the desired motion, along x, along y and L times heading
     error = _across(metres * _seen_from(reference, pose, pose[2]), along)
-    loops, added, integrals, status = _loops(settings), [], [], TrackStatus.OK
+    loops, integrals, status = _loops(settings), list[float](), TrackStatus.OK
+    added: list[float] = []
     for value, before, loop in zip(error.tolist(), integral, ("cross", "cross", "heading"), strict=True):
         off = value
         if loop == "heading" and not settings.sideways:  # towards the path

@@ -147,11 +147,10 @@ def observe_wheels(
     ``steer_rad`` (wheels,) are the angles of the steering, 0 without.  Of a robot that skids, ``track_ratio`` is its
     effective track over its track: its slip is counted beyond what turning takes.
     """
-    n = len(robot.wheels)
     if estimate is None:
         return unobserved(len(robot.logged_wheels))
-    motors, stale_s = robot.completed.motors, estimate_age(estimate, time_s)
-    rollers, (x_m, y_m) = robot.roller_angles_rad, np.transpose(robot.wheel_positions_m)
+    stale_s, rollers = estimate_age(estimate, time_s), robot.roller_angles_rad
+    x_m, y_m = np.transpose(robot.wheel_positions_m)
     angle = steer_rad + robot.wheel_directions_rad + rollers
     along = np.cos(angle) / np.cos(rollers), np.sin(angle) / np.cos(rollers)
     ahead, left, turn = estimate.speed_x_mps, estimate.speed_y_mps, track_ratio * estimate.yaw_rate_radps
@@ -168,22 +167,18 @@ def observe_wheels(
     standing = fastest < np.where(np.isnan(slip), 2.0, 1.0) * MIN_SPEED_MPS
     accel = (np.nan_to_num(one) for one in (estimate.accel_x_mps2, estimate.accel_y_mps2))
     accel_x, accel_y = (float(one) for one in accel)
-    torque_nm = np.full(n, math.nan)
-    if robot.describes("motors"):
-        torque_nm = estimate.current_a * (
-            motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
-        )
     rows = (
         speed,
         accel_x * along[0] + accel_y * along[1],
         np.where(standing & (stale_s < math.inf), 0.0, slip),
         np.where(standing, 0.0, estimate.slip_std),
-        torque_nm,
+        estimate.current_a * (robot.motors.nm_per_a if robot.describes("motors") else math.nan),
         estimate.wheel_speed_mps / robot.wheel_radius_m,
     )
     driven = np.isin(robot.wheels, robot.logged_wheels)
     speeds = (one for one in (estimate.speed_x_mps, estimate.speed_y_mps) if math.isfinite(one))
-    return WheelMotion(*(row[driven] for row in rows), chassis_mps=math.hypot(*speeds), stale_s=stale_s)
+    one, two, three, four, five, six = (row[driven] for row in rows)
+    return WheelMotion(one, two, three, four, five, six, math.hypot(*speeds), stale_s)
 
 
 def largest_forward(wheel_radps: Array, slip_ratio: Array) -> float:

@@ -9,7 +9,8 @@ controller drives the part p, behind the lag of the robot, and the measured one 
     w_c = x (w* + k_P e + k_I integral e dt)            (yaw rate that the kinematics is given)
 
 - x is that of the robot's description at first, 1 where it has none; then it follows the yaw rate of the wheels over
-  that of the robot while it turns, by the angle turned.  Where the wheels' speeds are compared with the ground, the
+  that of the robot while it turns, by the angle that the wheels would turn it, and the integral is changed so that the
+  wheels' speeds do not jump.  Where the wheels' speeds are compared with the ground, the
   robot's yaw rate counts x times: the slip that turning takes is no slip of traction.
 - The integral removes what is left: a side on softer ground, unequal radii.  The correction is bounded by a part of the
   wheels' speed, and by the speed at which a wheel would reverse.  Where it is bounded, or a wheel is at its motor's
@@ -40,10 +41,10 @@ class TurnSettings(NamedTuple):
     k_p: float = 0.3
     k_i_ps: float = 2.0
     lag_s: float = 0.2  #: T
-    limit_ratio: float = 0.2  #: change of a wheel's speed by the correction, over the speed of the fastest
+    limit_ratio: float = 0.3  #: change of a wheel's speed by the correction, over the speed of the fastest
     #: a robot that turns slower shows no effective track; the angle over which it is averaged; its bounds
-    turning_radps: float = 0.1
-    angle_rad: float = 1.0
+    turning_radps: float = 0.05
+    angle_rad: float = 0.5
     least_ratio: float = 0.8
     most_ratio: float = 4.0
 
@@ -125,8 +126,10 @@ def turn_step(
         left, right = turning.rolling[:, 2].tolist()
         rolled = float(wheel_speed_mps[1] - wheel_speed_mps[0]) / (right - left)
         shown = min(max(rolled / yaw_rate_radps, settings.least_ratio), settings.most_ratio)
-        turned = min(abs(yaw_rate_radps) * dt_s / settings.angle_rad, 1.0)
-        ratio += (shown - ratio) * turned if math.isfinite(rolled) else 0.0
+        turned = min(abs(rolled) * dt_s / settings.angle_rad, 1.0)
+        if math.isfinite(rolled):
+            ratio += (shown - ratio) * turned
+            integral = state.track_ratio / ratio * (desired + integral) - desired
     arms = ratio * turning.rolling[:, 2]
     speeds = turning.rolling[:, :2] @ twist[:2] + arms * desired
     fastest = float(np.abs(speeds).max())
@@ -142,8 +145,8 @@ def turn_step(
         grown = integral + settings.k_i_ps * error * dt_s
         asked = settings.k_p * error + grown
         added = min(max(asked, -least), most)
-        over = fastest + float(np.abs(arms).max()) * abs(added) > turning.limit_mps
-        if not ((asked != added or over) and asked * error > 0.0):
+        bounded = asked != added or fastest + float(np.abs(arms).max()) * abs(added) > turning.limit_mps
+        if not (bounded and asked * error > 0.0):
             integral = grown
     integral = min(max(integral, -least), most)
     given = np.array([twist[0], twist[1], ratio * (desired + added)])
