@@ -110,17 +110,17 @@ class LivePilot(Chain):
         super().__init__(robot.name, table, SWITCHING, Clocks())
         self.source = TerrainSource() if source is None else source
         channels = pilot_channels(driven) if channels is None else channels
-        wanted = pilot_channels(driven)
+        taken = pilot_channels(driven)
         if driven.drive != "swerve":  # their estimator takes what there is
-            wanted = {stream: tuple(names) for stream, names in channels.items()}
+            taken = {stream: tuple(names) for stream, names in channels.items()}
         if settings.controller not in OPEN_LOOP:
-            self._filter = pilot_estimator(driven, wanted, correction)
+            self._filter = pilot_estimator(driven, taken, correction)
         states = () if self._filter is None else self._filter.states
-        self.control = RobotControl(driven, table, settings, states, wanted)
+        self.control = RobotControl(driven, table, settings, states, taken)
         self._steering_zeros_rad = np.array(driven.steering_zeros_rad)
         self._columns = {
             stream: None if tuple(channels[stream]) == names else places_among(names, list(channels[stream]))
-            for stream, names in wanted.items()
+            for stream, names in taken.items()
             if stream in channels
         }
         self._awaits_steering = "steering" in channels and driven.drive == "swerve"

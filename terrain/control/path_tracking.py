@@ -86,17 +86,20 @@ def tracking_of(robot: Robot) -> TrackSettings:
     The heading of such a robot follows with the lag of its yaw rate, and its position more slowly, so that the loop of
     the position has a third of the heading's bandwidth.
     """
-    settings = SETTINGS._replace(arm_m=robot.wheelbase_m / 2.0, sideways=robot.sideways)
     if robot.sideways:
-        return settings
-    slower = {"heading_pm": 2.0, "heading_integral_pm2": 0.3, "cross_pm": 0.6, "cross_integral_pm2": 0.06}
-    limits = {
-        "heading_max_rad": 0.6,
-        "cross_max_rad": 0.5,
-        "heading_fastest_ps": 1.5,
-        "cross_fastest_ps": 0.5,
-    }
-    return settings._replace(**slower, **limits)
+        return SETTINGS._replace(arm_m=robot.wheelbase_m / 2.0)
+    return SETTINGS._replace(
+        arm_m=robot.wheelbase_m / 2.0,
+        sideways=False,
+        heading_pm=2.0,
+        heading_integral_pm2=0.3,
+        cross_pm=0.6,
+        cross_integral_pm2=0.06,
+        heading_max_rad=0.6,
+        cross_max_rad=0.5,
+        heading_fastest_ps=1.5,
+        cross_fastest_ps=0.5,
+    )
 
 
 def check_tracking(robot: Robot, settings: TrackSettings = SETTINGS, delay_s: float = DELAY_S) -> None:

@@ -133,7 +133,7 @@ def turn_step(
     arms = ratio * turning.rolling[:, 2]
     speeds = turning.rolling[:, :2] @ twist[:2] + arms * desired
     fastest = float(np.abs(speeds).max())
-    # by how much the yaw rate may change before a wheel would reverse, either way
+    # by how much the yaw rate may change before a wheel would reverse, in either direction
     least = most = settings.limit_ratio * fastest / float(np.abs(arms).max())
     for speed, arm in zip(speeds.tolist(), arms.tolist(), strict=True):
         if speed * arm > 0.0:

@@ -74,7 +74,6 @@ def test_a_wrong_clock_causes_no_jump_and_no_end_of_slip_control(time_s):
     ("robot", "table", "settings", "message"),
     [
         ("agrimaro", {}, {"controller": "best"}, "controller 'best' is unknown: use one of plain, ramp"),
-        ("husky", {}, {}, "robot husky: drive 'skid_steer' has no pilot, only 'swerve' has"),
         ("agrimaro", {"robot": "o"}, {}, "slip table default: is of the robot 'o', not of 'agrimaro'"),
         ("agrimaro", {}, {"controller": "ramp", "ramp_mps2": 0.0}, "ramp_mps2 is 0.0"),
         ("agrimaro", {}, {"controller": "thesis", "delay_s": 1.5}, "delay_s is 1.5, 0 to 1 s is required"),

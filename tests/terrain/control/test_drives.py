@@ -87,8 +87,8 @@ class RollingRobot:
     def _move(self, command, dt_s):
         robot, force = self.robot, np.zeros(3)
         if command is not None:
-            wanted = command.wheel_radps * robot.wheel_radius_m
-            self.wheel_mps += (wanted - self.wheel_mps) * dt_s / self.lag_s
+            desired = command.wheel_radps * robot.wheel_radius_m
+            self.wheel_mps += (desired - self.wheel_mps) * dt_s / self.lag_s
             self.steer_rad += (command.steer_rad - self.steer_rad) * dt_s / self.lag_s
         load = robot.mass_kg * G / len(self.contacts)
         v_x, v_y, turn = self.motion
