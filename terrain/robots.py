@@ -10,8 +10,9 @@ where it was calibrated, its 95 % interval::
       gyro_bias_z_radps: {value: 0.0021, unit: radps, source: "terrain calibrate", interval: [0.0019, 0.0023]}
 
 Geometry and mass are required of every robot; the sections ``body``, ``motors``, ``steering``, ``camera`` and
-``sensors`` by what simulates a robot or filters its log.  The section ``identified`` keeps what logs of one
-robot showed beside its nominal figures: its effective track, the radius that its wheels roll on, delays.  The
+``sensors`` by what simulates a robot or filters its log, and ``antenna``, which says where that of a satellite
+receiver is mounted, may be left out: then it is above the body's origin.  The section ``identified`` keeps what logs
+of one robot showed beside its nominal figures: its effective track, the radius that its wheels roll on, delays.  The
 list ``filters`` names the filters and observers that apply, where not all of its drive do.  The section
 ``effects`` of an extended robot (:mod:`terrain.effects`) says what else acts, and the section ``learned``
 (:mod:`terrain.learned_term`) what acts without a name; :mod:`terrain.extension` makes use of both.  The section
@@ -36,7 +37,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
@@ -267,7 +268,16 @@ class Sensors:
     yaw_std_rad: float
 
 
-Part: TypeAlias = Body | Motors | Steering | Camera | Sensors  #: Any section of a description.
+@dataclass(frozen=True, slots=True)
+class Antenna:
+    """Where the antenna of a satellite receiver is mounted on the body."""
+
+    lever_x_m: Signed
+    lever_y_m: Signed
+    lever_z_m: Signed = 0.0
+
+
+Part: TypeAlias = Body | Motors | Steering | Camera | Sensors | Antenna  #: Any section of a description.
 
 
 #: What each section of a description is read into, by its key in the file.
@@ -277,6 +287,7 @@ KIND_OF_SECTION: Mapping[str, type[Part]] = {
     "steering": Steering,
     "camera": Camera,
     "sensors": Sensors,
+    "antenna": Antenna,
 }
 
 
@@ -342,6 +353,7 @@ class Robot(ABC):
     steering: Steering = field(init=False, repr=False, compare=False)  #: limits and zeros
     camera: Camera = field(init=False, repr=False, compare=False)  #: tracking camera
     sensors: Sensors = field(init=False, repr=False, compare=False)  #: all but the camera
+    antenna: Antenna = field(init=False, repr=False, compare=False)  #: of a satellite receiver
 
     wheels: tuple[str, ...] = field(init=False, repr=False, compare=False)  #: names, as channels have them
     #: names of the wheels whose rates are logged, in the order of :attr:`rate_channels`
@@ -597,7 +609,7 @@ class SwerveRobot(Robot):
     """
 
     drive: ClassVar[str] = "swerve"
-    sections: ClassVar[tuple[str, ...]] = tuple(KIND_OF_SECTION)
+    sections: ClassVar[tuple[str, ...]] = ("body", "motors", "steering", "camera", "sensors")
     n_tyres: ClassVar[int] = 3
 
     def wheel_table(self) -> tuple[Wheel, ...]:
@@ -924,8 +936,8 @@ def robot_from(file: str, described: Any) -> Robot:
     """Return the robot of a description's content; ``file`` is what messages call it."""
     drive = described.get("drive") if isinstance(described, dict) else None
     kind = KIND_OF_DRIVE.get(drive, SkidSteerRobot) if isinstance(drive, str) else SkidSteerRobot
-    optional = (*KIND_OF_SECTION, "identified", "filters", "effects", "learned", "deviation", "watch")
-    check_keys(file, described, ["name", "drive", *kind.numbers], optional=optional)
+    others = (*KIND_OF_SECTION, "identified", "filters", "effects", "learned", "deviation", "watch")
+    check_keys(file, described, ["name", "drive", *kind.numbers], optional=others)
     name = described["name"]
     if not isinstance(name, str) or not name:
         raise ConfigError(f"{file}: name is {shown(name)}, a word is required")
@@ -937,8 +949,10 @@ def robot_from(file: str, described: Any) -> Robot:
     for section, part in KIND_OF_SECTION.items():
         if described.get(section) is not None:
             place, lows = f"{file}: {section}", {item.name: LEAST[item.type] for item in fields(part)}
-            check_keys(place, described[section], list(lows))
-            parts[section] = part(**numbers(place, described[section], lows))
+            given = described[section]
+            optional = tuple(item.name for item in fields(part) if item.default is not MISSING)
+            check_keys(place, given, [key for key in lows if key not in optional], optional=optional)
+            parts[section] = part(**numbers(place, given, {key: lows[key] for key in lows if key in given}))
             entries |= {f"{section}.{key}": entry for key, entry in described[section].items()}
     assumed = frozenset(k for k, e in entries.items() if e["source"].strip().lower().startswith("assumed"))
     shown_by_logs, filters = described.get("identified", {}), described.get("filters", [])

@@ -106,7 +106,7 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
             conditions=Conditions(payload_kg=settings.payload_kg, grade_ratio=(gradient, 0.0)),
             faults=Faults(camera_lost_s=tuple(camera_lost_s)),
             gnss=Gnss() if settings.gnss else None,
-            effects=effects,
+            effects=effects or None,
         )
         write_run(simulated, out)
         run_ids.append(simulated.run_id)

@@ -101,7 +101,7 @@ def make_situation(
         chosen["grade_ratio"] = (math.tan(math.radians(options.grade_deg)), 0.0)
     if options.radius_factors is not None:
         chosen["radius_factors"] = options.radius_factors
-    conditions = replace(draw_conditions(rng), **chosen)
+    conditions = replace(draw_conditions(rng, robot=robot), **chosen)
     number, names = int(driven.generate_state(1)[0]), list(soils)
     duration_s, speed_mps, accel_mps2 = options.duration_s, options.speed_mps, options.accel_mps2
     changes = {"accel_mps2": accel_mps2} if accel_mps2 != 1.0 else {}

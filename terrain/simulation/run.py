@@ -33,6 +33,7 @@ from terrain.extension import warn_outside
 from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, Command, RunLog, Sample, Stream
 from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot, load_robot
+from terrain.simulation.assumed import with_assumed
 from terrain.simulation.scenario import (
     NO_FAULTS,
     RATE_HZ,
@@ -192,6 +193,8 @@ def simulate_run(
     """
     if isinstance(robot, str | Path):
         robot = load_robot(robot)
+    dynamic = _dynamic(robot, effects)
+    robot = with_assumed(robot) if dynamic else robot
     commands = scenario if isinstance(scenario, Scenario) else None
     scenario = scenario.name if isinstance(scenario, Scenario) else scenario
     if commands is not None and duration_s is not None:
@@ -226,16 +229,15 @@ def simulate_run(
     if vary:
         rng = np.random.default_rng(drawn)
         soils = {name: scattered(soil, rng) for name, soil in soils.items()}
-        conditions = draw_conditions(rng, conditions)
-    planar = not isinstance(robot, SwerveRobot)
-    if planar and terrain == COURSE:
-        raise ConfigError(f"robot {robot.name}: scenario {COURSE!r} is for swerve robots")
+        conditions = draw_conditions(rng, conditions, robot if dynamic else None)
+    if not dynamic and terrain == COURSE:
+        raise ConfigError(f"robot {robot.name}: scenario {COURSE!r} is driven without effects")
     drive_seed = int(driven.generate_state(1)[0])
     drive = commands or make_scenario(scenario, robot, list(soils), duration_s, seed=drive_seed)
     ground: Any = soils
     options: dict[str, Any] = {"gnss": gnss}
     effects = effects or {}
-    if planar:
+    if not dynamic:
         ground, options = soils[terrain], {}
         if (
             not isinstance(robot, TrackedRobot)
@@ -257,6 +259,12 @@ def simulate_run(
     run = simulate(robot, drive, ground, simulated, run_id=run_id, **options)
     warn_outside(run, robot)
     return run
+
+
+def _dynamic(robot: Robot, effects: Mapping[str, float] | None) -> bool:
+    """Return whether the dynamic plant simulates a robot by names; of effects, those of swerve robots alone."""
+    plain = effects is None and not robot.effects and not robot.learned
+    return isinstance(robot, SwerveRobot) or (plain and robot.drive == "skid_steer")
 
 
 def run_id_of(terrain: str, scenario: str, number: int) -> str:
@@ -373,7 +381,7 @@ def learning_run(
         {nominal.name: soil},
         simulated,
         run_id=run_id or f"{nominal.name}_{drive.kind}_{number:02d}",
-        conditions=draw_conditions(rng, ground),
+        conditions=draw_conditions(rng, ground, robot),
         controller=SlipSweep(robot) if drive.kind == "sweep" else None,
     )
 

@@ -193,8 +193,8 @@ def make_scenario(
       backward or a turn on the spot; drawn
     - ``course``: over patches of 6 to 12 m of every terrain in turn, in drawn order, at changing speed
 
-    Robots that cannot drive sideways have no ``crab``, and in ``complex`` turn on the spot instead; only swerve robots
-    have ``course``, and car-like ones no ``spot_turn``.
+    Robots that cannot drive sideways have no ``crab``, and in ``complex`` turn on the spot instead; car-like ones
+    have no ``spot_turn``.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ def make_scenario(
             f"scenario {name!r} is driven on one terrain, {len(grounds)} are given: use 'course'"
         )
     car = isinstance(robot, BicycleRobot)
-    able = {"crab": robot.sideways, "course": isinstance(robot, SwerveRobot), "spot_turn": not car}
+    able = {"crab": robot.sideways, "spot_turn": not car}
     if not able.get(name, True):
         raise ConfigError(f"scenario {name!r} is not for robot {robot.name} with the drive {robot.drive!r}")
     if not (_is_number(accel_mps2) or accel_mps2 == math.inf) or not accel_mps2 > 0:
@@ -513,10 +513,16 @@ def field_spread() -> dict[str, float]:
     return {name: float(entry["value"]) for name, entry in described.items() if name != "name"}
 
 
-def draw_conditions(rng: np.random.Generator, nominal: Conditions | None = None) -> Conditions:
+SPREAD_KG, SPREAD_M = 90.0, 1.015  # mass and wheelbase of the robot whose loads the spread states
+
+
+def draw_conditions(
+    rng: np.random.Generator, nominal: Conditions | None = None, robot: Robot | None = None
+) -> Conditions:
     """Return the conditions of one run, drawn around the nominal ones.
 
-    Normal draws are cut at two standard deviations, so that no run is impossible.  Lengths are the spread's.
+    Normal draws are cut at two standard deviations, so that no run is impossible.  Lengths are the spread's; the load
+    and its place are in proportion to a robot's mass and wheelbase.
     """
     nominal, spread = nominal or Conditions(), field_spread()
 
@@ -525,9 +531,10 @@ def draw_conditions(rng: np.random.Generator, nominal: Conditions | None = None)
 
     grade = np.array(nominal.grade_ratio) + normal("grade_std_ratio", 2)
     radius = np.array(nominal.radius_factors) * (1.0 + normal("radius_std_ratio", 3))
-    offset_m = spread["payload_offset_m"]
+    heavy, large = (robot.mass_kg / SPREAD_KG, robot.wheelbase_m / SPREAD_M) if robot else (1.0, 1.0)
+    offset_m = spread["payload_offset_m"] * large
     offset = np.array(nominal.payload_m) + rng.uniform(-offset_m, offset_m, 2)
-    payload_kg = nominal.payload_kg + float(rng.uniform(0.0, spread["payload_max_kg"]))
+    payload_kg = nominal.payload_kg + float(rng.uniform(0.0, spread["payload_max_kg"] * heavy))
     undulation = nominal.undulation_ratio + float(normal("undulation_std_ratio", 1)[0])
     rougher = float(np.exp(normal("roughness_log_std_ratio", 1)[0]))
     return replace(

@@ -27,14 +27,18 @@ from terrain.kernels import inner, njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import to_camera
 from terrain.kinematics.wheels import point_velocity
-from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
+from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, TWIST
 from terrain.records import Array, Reading, Stream, read_only
-from terrain.robots import Robot, Sensors
+from terrain.robots import Antenna, Robot, Sensors, SwerveRobot
 from terrain.simulation.scenario import Faults
 
 # Step of the rows in a closed loop and of the dynamic plant, whose fastest mode is that of the contact, near 170
 # rad/s: a sixth of a radian a step.
 STEP_S = 0.001
+
+MAX_WHEELS = (
+    4  # for which the rows of the dynamic plant have room; of a robot with fewer the first ones count
+)
 
 BODY = record(
     numbers(
@@ -59,7 +63,7 @@ BODY_ROW = record(
         "grade_x_ratio grade_y_ratio ride_z_mps2 ride_roll_rad ride_pitch_rad ride_roll_radps2 ride_pitch_radps2 "
         "path_m leg_rad"
     )
-    | {"wheels": (WHEEL_ROW, 3), "encoder_rad": (float, 3)}
+    | {"wheels": (WHEEL_ROW, MAX_WHEELS), "encoder_rad": (float, MAX_WHEELS)}
 )
 """What the dynamic plant writes each step at the body's origin, of each wheel, and of the angles that encoders see,
 which differ from the headings where a linkage or a leg has play."""
@@ -209,21 +213,25 @@ def wheel_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> Sens
 
     Effects act before the noise.
     """
-    motors, sensors = robot.motors, robot.sensors
+    sensors, n = robot.sensors, len(robot.wheels)
     time_s, rows = motion.at(sensors.wheels_rate_hz)
-    per_amp_nm = motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
-    motor_noise = sensors.motor_std_radps * rng.standard_normal((len(rows), 3))
-    current_noise = sensors.current_std_a * rng.standard_normal((len(rows), 3))
-    changed = on_samples("wheels", WHEELS_CHANNELS, robot.effects)
+    logged = np.isin(robot.wheels, robot.logged_wheels)  # rates, and currents of the motors
+    driven = [name for name, is_logged in zip(robot.wheels, logged, strict=True) if is_logged]
+    per_radps = robot.motors.reduction_ratio if robot.by_motor else robot.wheel_radius_m
+    std = sensors.motor_std_radps * per_radps / robot.motors.reduction_ratio
+    rate_noise = std * rng.standard_normal((len(rows), len(driven)))
+    current_noise = sensors.current_std_a * rng.standard_normal((len(rows), len(driven)))
+    channels = (*robot.rate_channels, *wheel_channels("current_a", driven))
+    changed = on_samples("wheels", channels, robot.effects)
 
     def write(new: slice, rows: Array, _: Array) -> Array:
-        wheels = motion.record["wheels"][rows]
-        true = wheels["reported_radps"] * motors.reduction_ratio, wheels["torque_nm"] / per_amp_nm
+        wheels = motion.record["wheels"][rows][:, :n][:, logged]
+        true = wheels["reported_radps"] * per_radps, wheels["torque_nm"] / robot.motors.nm_per_a
         rates, current_a = np.hsplit(changed(time_s[new], np.hstack(true))[1], 2)
         counts = np.abs(rates) > STANDSTILL_RADPS  # an encoder that counts no step has no noise
-        return np.hstack([rates + motor_noise[new] * counts, current_a + current_noise[new]])
+        return np.hstack([rates + rate_noise[new] * counts, current_a + current_noise[new]])
 
-    return Sensor(motion, WHEELS_CHANNELS, (time_s, rows), write)
+    return Sensor(motion, channels, (time_s, rows), write)
 
 
 def encoder_angle(steer_rad: Array, zeros_rad: Array, noise_rad: Array | float, step_rad: float) -> Array:
@@ -249,12 +257,13 @@ def steering_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> S
     sensors = robot.sensors
     stamps = motion.at(sensors.steering_rate_hz)
     zeros, step_rad = robot.steering_zeros_rad, 2 * math.pi / sensors.steering_steps_ratio
-    noise = sensors.steering_std_rad * rng.standard_normal((len(stamps[0]), 3))
+    n = len(robot.steered_wheels)
+    noise = sensors.steering_std_rad * rng.standard_normal((len(stamps[0]), n))
 
     def write(new: slice, rows: Array, _: Array) -> Array:
-        return encoder_angle(motion.record["encoder_rad"][rows], zeros, noise[new], step_rad)
+        return encoder_angle(motion.record["encoder_rad"][rows, :n], zeros[:n], noise[new], step_rad)
 
-    return Sensor(motion, STEERING_CHANNELS, stamps, write)
+    return Sensor(motion, robot.steer_channels, stamps, write)
 
 
 # Bandwidths of the BNO055 in its fusion modes (Bosch data sheet), and noise of its fused roll and pitch; assumed.
@@ -379,6 +388,8 @@ _SEEN = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "roll_rad", "pitch_rad"
 def camera_sensor(motion: Motion, robot: Robot, rng: np.random.Generator, faults: Faults) -> Sensor:
     """Return a tracking camera in its own frames: drifting pose, noisy speed, dropouts and relocalisation jumps.
 
+    Of other than swerve robots it gives the speed of its place in the axes of the body alone.
+
     Without noise its samples are those of :func:`terrain.kinematics.camera.odometry_stream`; lost samples are left out.
     Effects act on samples with their noise.
     """
@@ -416,10 +427,20 @@ def camera_sensor(motion: Motion, robot: Robot, rng: np.random.Generator, faults
         values = camera_values(place + place_error[new], seen, lever_m, record["yaw_rad"][0] + yaw_noise_0)
         values[:, 7:10] += speed_noise[new]
         values[:, 10:13] += rate_noise[new]
+        if not isinstance(robot, SwerveRobot):
+            ahead, left = point_velocity(*seen[:, :3].T, *lever_m[:2])
+            return np.column_stack([ahead, left]) + speed_noise[new, :2]
         return changed(time_s[~lost][new], values)[1]
 
-    stamps = time_s[~lost], rows[~lost]
-    return Sensor(motion, CAMERA_CHANNELS, stamps, write, fill, [camera.time_constant_s] * len(_SEEN))
+    stamps, swerve = (time_s[~lost], rows[~lost]), isinstance(robot, SwerveRobot)
+    return Sensor(
+        motion,
+        CAMERA_CHANNELS if swerve else TWIST[:2],
+        stamps,
+        write,
+        fill,
+        [camera.time_constant_s] * len(_SEEN),
+    )
 
 
 @njit
@@ -475,8 +496,11 @@ def _rotated(
     )
 
 
+SWAY_S = 0.05  # over which a receiver sees its antenna sway with the body
+
+
 class Gnss(NamedTuple):
-    """An RTK receiver with its antenna above the body's origin.
+    """An RTK receiver; its antenna is where the robot's description has it, by default above the body's origin.
 
     Fix to 2 cm and 10 Hz: thesis 5.1.1.  A float solution of half a metre, the latency of the radio link, the accuracy
     of the Doppler speed and how long a fix lasts are assumed.
@@ -491,7 +515,7 @@ class Gnss(NamedTuple):
     float_length_s: float = 5.0
 
 
-def gnss_sensor(motion: Motion, receiver: Gnss, rng: np.random.Generator) -> Sensor:
+def gnss_sensor(motion: Motion, robot: Robot, receiver: Gnss, rng: np.random.Generator) -> Sensor:
     """Return RTK positions and speeds in the world frame, with stretches of float."""
     time_s, rows = motion.at(receiver.rate_hz, receiver.latency_s)
     fixed, state = np.empty(len(rows), dtype=bool), True
@@ -503,9 +527,23 @@ def gnss_sensor(motion: Motion, receiver: Gnss, rng: np.random.Generator) -> Sen
     noise = np.column_stack([noise, receiver.speed_std_mps * rng.standard_normal((len(rows), 2))])
 
     def write(new: slice, rows: Array, _: Array) -> Array:
-        return fixes(motion.record[rows], noise[new], std[new], fixed[new])
+        at = fixes(motion.record[rows], noise[new], std[new], fixed[new])
+        if robot.describes("antenna"):
+            at[:, :4] += _antenna(motion, rows, robot.antenna)
+        return at
 
     return Sensor(motion, GNSS_CHANNELS, (time_s, rows), write)
+
+
+def _antenna(motion: Motion, rows: Array, place: Antenna) -> Array:
+    """Return what position and velocity (n, 4) of an antenna add to those of the body's origin that it sways over."""
+    up, turn, yaw = motion.up[rows], motion.record["yaw_rate_radps"][rows], motion.record["yaw_rad"][rows]
+    sway = (up - motion.up[np.maximum(rows - round(SWAY_S / STEP_S), 0)]) / SWAY_S
+    x_m, y_m = place.lever_x_m - place.lever_z_m * up[:, 0], place.lever_y_m - place.lever_z_m * up[:, 1]
+    ahead, left = -place.lever_z_m * sway[:, 0] - turn * y_m, -place.lever_z_m * sway[:, 1] + turn * x_m
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    place_m = x_m * cos - y_m * sin, x_m * sin + y_m * cos
+    return np.column_stack([*place_m, ahead * cos - left * sin, ahead * sin + left * cos])
 
 
 def fixes(rows: Array, noise: Array, std_m: Array | float, fixed: Array | float = 1.0) -> Array:

@@ -88,10 +88,12 @@ from terrain.kernels import filled, inner, is_finite, njit, numbers, record
 from terrain.kinematics.commands import wheel_motion
 from terrain.kinematics.wheels import point_velocity, rolled_twist
 from terrain.learned_term import INPUTS, Factor, rolling_change
-from terrain.logs.schema import unit_of
+from terrain.logs.schema import TWIST, unit_of
 from terrain.records import Array, Command, Label, Sample, Stream, read_only
-from terrain.robots import Robot, SwerveRobot, as_drive
+from terrain.robots import Robot, SwerveRobot
 from terrain.simulation import sensors as sensing
+from terrain.simulation.assumed import with_assumed
+from terrain.simulation.contacts import Contact, contacts_of
 from terrain.simulation.scenario import Conditions, Faults, Scenario
 from terrain.simulation.sensors import BODY_ROW, STEP_S, Gnss, Motion
 from terrain.terramechanics.soil import Soil
@@ -105,6 +107,12 @@ FIELD_STEP_M = 0.1  # grid of the variation of the terrain along the path
 # Cells of terrain up to the farthest point that the fastest wheel can reach; 24 h at 2 m/s take 3.5 million.
 MAX_FIELD_CELLS = 5 * 10**6
 MAX_DELAY_STEPS = 500  # steps of the longest delay of the steering, half a second
+# Records have room for so many wheels and contacts: one compiled plant for all drives.
+MAX_WHEELS = sensing.MAX_WHEELS
+MAX_CONTACTS = 8
+COUNTED_S = (
+    0.005  # time constant of encoders without a low-pass of their own, whose steps are counted over some time
+)
 CONTACT_LIMIT_PS2 = 4.0 / (STEP_S * (STEP_S + 2.0 * DEFLECTION_DAMPING_S))  # largest stable ``k`` in 1/s^2
 # Load transfer and rough ground load a wheel with up to so many times its share of the weight.
 LOAD_MARGIN_RATIO = 2.0
@@ -112,17 +120,35 @@ LOAD_MARGIN_RATIO = 2.0
 _SMALL_SLIP = 1e-4
 
 # A soil under the wheels, its ISO 8608 roughness, and the path length at which it begins, the first at 0.
-PATCH = record({"ground": GROUND, "roughness_m3": float, "start_m": float})
+PATCH = record({"ground": GROUND, **numbers("roughness_m3 roller_friction_ratio start_m")})
+
+CONTACT = record(
+    numbers(
+        "x_m y_m radius_m roller_rad direction_rad side_ratio ackermann_m load_fraction ride_ratio ride_roll_1pm "
+        "ride_pitch_1pm"
+    )
+    | {"load_per_force_ratio": (float, 2), "wheel": int}
+)
+"""A contact with the ground of a wheel of the robot: its place and rolling radius; the axis of its rollers from the
+direction that it drives along, and that direction where it is not steered; -1 or 1 for the left or right tyre behind a
+differential; the wheelbase where an axle is steered, so that all its tyres roll about one centre; its share of the
+weight, and what a force along x or y of the body adds to it; what the ride of its corner is of that of the body."""
 
 PLANT = record(
     {
-        "wheels_m": (float, (3, 2)),
+        "wheels_m": (float, (MAX_WHEELS, 2)),
+        "wheel_direction_rad": (float, MAX_WHEELS),
+        "wheel_roller_rad": (float, MAX_WHEELS),
+        "driven": (bool, MAX_WHEELS),
+        "radius_m": (float, MAX_WHEELS),
+        "steer_offset_rad": (float, MAX_WHEELS),
+        "contacts": (CONTACT, MAX_CONTACTS),
+        "n_wheels": int,
+        "n_contacts": int,
         "com_m": (float, 2),
-        "radius_m": (float, 3),
-        "load_fraction": (float, 3),
-        "load_per_force_ratio": (float, (3, 2)),
         "grade_ratio": (float, 2),
-        "steer_offset_rad": (float, 3),
+        "rollers": bool,
+        "skids": bool,
         "linked": bool,
         "yields": bool,
         "effects": EFFECTS,
@@ -135,16 +161,25 @@ PLANT = record(
     }
 )
 """All numbers of one run that do not change while it is driven, by their names in the robot's description and in the
-conditions; whether effects act in the linkages of the steering and where wheels touch the ground, and all effects."""
+conditions; of wheels and contacts the first ones count; whether wheels have rollers, whether slip is over the speed in
+any direction, whether effects act in the linkages of the steering and where wheels touch the ground; all effects."""
+
+CONTACT_STATE = record(
+    numbers(
+        "deflection_x_m deflection_y_m ride_m ride_mps ride_mps2 road_m contact_m creep_ratio along_mps drift_mps "
+        "fastest_mps"
+    )
+)
+"""A contact; its creep is over the slip of the ground, and its speeds are those of the start of the step."""
 
 WHEEL_STATE = record(
     numbers(
-        "rate_radps angle_rad steer_rad steer_motor_rad steer_motor_radps deflection_x_m "
-        "deflection_y_m torque_nm integral_nm estimate_radps reported_radps hall_count ride_m "
-        "ride_mps ride_mps2 road_m contact_m heading_rad lagged_rad creep_ratio"
+        "rate_radps spread_radps angle_rad steer_rad steer_motor_rad steer_motor_radps torque_nm integral_nm "
+        "estimate_radps reported_radps hall_count heading_rad lagged_rad load_nm spread_nm"
     )
 )
-"""A wheel; its heading is that in the play of its linkage, and its creep is over the slip of the ground."""
+"""A wheel; its heading is that in the play of its linkage, its spread half of what the right tyre behind a differential
+turns faster than the left one, and its loads are what the ground asks of it."""
 
 STATE = record(
     numbers(
@@ -152,7 +187,8 @@ STATE = record(
         "drift_x_mps drift_y_mps drift_radps "
         "accel_y_mps2 leg_rad"
     )
-    | {"wheels": (WHEEL_STATE, 3), "n_steps": int, "late_rad": (float, (MAX_DELAY_STEPS, 3))}
+    | {"wheels": (WHEEL_STATE, MAX_WHEELS), "contacts": (CONTACT_STATE, MAX_CONTACTS)}
+    | {"n_steps": int, "late_rad": (float, (MAX_DELAY_STEPS, MAX_WHEELS))}
 )
 """Position is that of the body's origin; speeds and accelerations (dv/dt + w x v, of the step before) are those of its
 centre of mass in body axes; contacts drift by what was learned of the motion; the third leg is at 0 in the middle of
@@ -163,7 +199,7 @@ class TerrainProfile(NamedTuple):
     """The terrain of one run along the path."""
 
     patches: Array  # (patches,) of :data:`PATCH`
-    field: Array  # (2, 3, cells) factors along the path on thrust and on resistance, for each wheel
+    field: Array  # (2, contacts, cells) factors along the path on thrust and on resistance, for each contact
 
 
 def draw_profile(
@@ -194,7 +230,7 @@ def draw_profile(
             f"{MAX_FIELD_CELLS * FIELD_STEP_M / 2e3:g} km of terrain are simulated at most"
         )
     keep = math.exp(-FIELD_STEP_M / conditions.field_length_m)
-    white = rng.standard_normal((2, 3, n_cells))
+    white = rng.standard_normal((2, len(contacts_of(robot)), n_cells))
     white[:, :, 1:] *= math.sqrt(1.0 - keep**2)
     unit = lfilter([1.0], [1.0, -keep], white, axis=2)
     patch_of_cell = np.searchsorted(start_m, np.arange(n_cells) * FIELD_STEP_M, side="right") - 1
@@ -210,9 +246,11 @@ def patches_on(
 ) -> Array:
     """Return soils under the wheels of a robot, with their roughness and starts, (soils,) of :data:`PATCH`."""
     body, patches = robot.body, np.zeros(len(soils), PATCH)
-    wheel = robot.wheel_radius_m, body.tyre_width_m, body.contact_length_m
     for patch, soil in zip(patches, soils, strict=True):
-        (patch["ground"],) = ground_record(soil, *wheel)
+        (patch["ground"],) = ground_record(
+            soil, robot.wheel_radius_m, body.tyre_width_m, body.contact_length_m
+        )
+        patch["roller_friction_ratio"] = np.nan_to_num(soil.roller_friction_ratio)
     patches["roughness_m3"], patches["start_m"] = roughness_m3, start_m
     return patches
 
@@ -223,53 +261,82 @@ def make_plant(robot: Robot, conditions: Conditions) -> Array:
     Raises
     ------
     ConfigError
-        if the load takes the centre of mass out of the triangle of the wheels.
+        if the load takes the centre of mass out of the area between the contacts.
     """
-    body, motors, steering, sensors = robot.body, robot.motors, robot.steering, robot.sensors
-    parts = (steering, body, motors, sensors, conditions)  # a torque is that of the motors
+    body, motors, sensors = robot.body, robot.motors, robot.sensors
+    steering = [robot.steering] if robot.steered else []
+    parts = (*steering, body, motors, sensors, conditions)  # a torque is that of the motors
     described = {n: getattr(part, n) for part in parts for n in PLANT.names or () if hasattr(part, n)}
     effects = dict.fromkeys(parameters_of(robot.drive), 0.0) | dict(robot.effects)
     mass_kg = robot.mass_kg * (1.0 + effects["payload_ratio"]) + conditions.payload_kg
-    half = 0.5 * effects["one_sided_radius_ratio"]
-    rolling = (1.0 + effects["wheel_radius_ratio"]) * np.array([1.0 - half, 1.0 - half, 1.0 + half])
+    n, half = len(robot.wheels), 0.5 * effects["one_sided_radius_ratio"]
+    rolling = (1.0 + effects["wheel_radius_ratio"]) * np.array([*[1.0 - half] * (n - 1), 1.0 + half])
+    factors = np.array([*conditions.radius_factors, *[1.0] * n][:n])
     offset_m = conditions.payload_kg / mass_kg * np.asarray(conditions.payload_m)
     com_m = np.array([body.com_x_m, body.com_y_m]) + offset_m
-    # Rows: vertical force, moment about y (x arm), moment about x (y arm); columns: the three wheels.
-    inverse = np.linalg.inv(np.vstack([np.ones(3), robot.wheel_positions_m.T]))
+    # Rows: vertical force, moment about y (x arm), moment about x (y arm); columns: the contacts.  Of more than three
+    # the springs under a rigid body give the loads: those of least squares.
+    places = contacts_of(robot)
+    balance = np.array([[1.0, place.x_m, place.y_m] for place in places]).T
+    inverse = np.linalg.inv(balance) if len(places) == 3 else np.linalg.pinv(balance)
     load_fraction = inverse @ np.array([1.0, com_m[0], com_m[1]])
     if load_fraction.min() <= 0.0:
         x_m, y_m = conditions.payload_m
         raise ConfigError(
             f"robot {robot.name}: a payload of {conditions.payload_kg:g} kg at ({x_m:g}, {y_m:g}) m "
-            f"from the centre of mass tips it over: wheel {int(load_fraction.argmin()) + 1} would carry "
+            f"from the centre of mass tips it over: wheel {places[int(load_fraction.argmin())].wheel + 1} would carry "
             "nothing"
         )
-    of_robot = {
+    wheels: dict[str, Any] = {
         "wheels_m": robot.wheel_positions_m,
+        "wheel_direction_rad": robot.wheel_directions_rad,
+        "wheel_roller_rad": robot.roller_angles_rad,
+        "radius_m": robot.wheel_radius_m * factors * rolling,
+        "driven": np.ones(n),
+        "steer_offset_rad": [effects.get(f"steering_offset_{i + 1}_rad", 0.0) for i in range(n)],
+    }
+    of_robot = {
         "com_m": com_m,
+        "n_wheels": n,
+        "n_contacts": len(places),
+        "rollers": robot.on_omni_wheels,
+        "skids": not robot.steered,
         "mass_kg": mass_kg,
         "weight_n": robot.mass_kg * GRAVITY_MPS2,
         "yaw_inertia_kgm2": body.yaw_inertia_kgm2 * mass_kg / robot.mass_kg,
-        "radius_m": robot.wheel_radius_m * np.array(conditions.radius_factors) * rolling,
-        "load_fraction": load_fraction,
-        "load_per_force_ratio": -body.com_height_m * inverse[:, 1:],
+        "encoder_time_constant_s": max(sensors.encoder_time_constant_s, COUNTED_S),
+        "leg_backlash_rad": conditions.leg_backlash_rad if isinstance(robot, SwerveRobot) else 0.0,
         "hall_steps": sensors.hall_steps_ratio * motors.reduction_ratio / (2 * math.pi),
-        "linked": any(effects[name] != 0.0 for name in in_plant(Stage.LINKAGE)),
-        "steer_offset_rad": [effects[f"steering_offset_{i}_rad"] for i in (1, 2, 3)],
-        "yields": any(effects[name] != 0.0 for name in in_plant(Stage.CONTACT)),
+        "linked": any(effects[name] != 0.0 for name in in_plant(Stage.LINKAGE) if name in effects),
+        "yields": any(effects[name] != 0.0 for name in in_plant(Stage.CONTACT) if name in effects),
         "effects": vector_of(effects).view(EFFECTS),
     }
-    return filled(PLANT, **(described | of_robot))
+    plant = filled(PLANT, **(described | of_robot))
+    for name, values in wheels.items():
+        plant[name][0, :n] = values
+    for contact, place, (ride, ride_pitch, ride_roll), load in zip(
+        plant["contacts"][0], places, inverse, load_fraction, strict=False
+    ):
+        contact["load_per_force_ratio"] = -body.com_height_m * np.array([ride_pitch, ride_roll])
+        for name in Contact._fields:
+            contact[name] = getattr(place, name)
+        for name in ("radius_m", "direction_rad", "roller_rad"):
+            contact[name] = wheels["radius_m" if name == "radius_m" else f"wheel_{name}"][place.wheel]
+        contact["load_fraction"], contact["ride_ratio"] = load, ride
+        contact["ride_roll_1pm"], contact["ride_pitch_1pm"] = ride_roll, -ride_pitch
+    return plant
 
 
 def start_state(steer_rad: Array) -> Array:
     """Return the state, (1,) of :data:`STATE`, of a robot at rest at the origin, its steering motors at 0.
 
-    Its wheels hang in their play at ``steer_rad`` (3,).
+    Its wheels hang in their play at ``steer_rad`` (wheels,).
     """
-    wheels = np.zeros(3, WHEEL_STATE)
-    wheels["steer_rad"] = wheels["heading_rad"] = wheels["lagged_rad"] = steer_rad
-    return filled(STATE, wheels=wheels, late_rad=steer_rad)
+    state, n = filled(STATE), len(steer_rad)
+    for name in ("steer_rad", "heading_rad", "lagged_rad"):
+        state["wheels"][name][0, :n] = steer_rad
+    state["late_rad"][0, :, :n] = steer_rad
+    return state
 
 
 def check_step(plant: Array, profile: TerrainProfile, name: str) -> None:
@@ -283,17 +350,19 @@ def check_step(plant: Array, profile: TerrainProfile, name: str) -> None:
         if the contacts, with :data:`LOAD_MARGIN_RATIO`, or the tyres are beyond their limit, or not finite.
     """
     robot, mass_kg = plant[0], float(plant["mass_kg"][0])
-    load_n = mass_kg * GRAVITY_MPS2 * robot["load_fraction"]
-    spin = robot["radius_m"] ** 2 / robot["wheel_inertia_kgm2"]
-    arm_m2 = ((robot["wheels_m"] - robot["com_m"]) ** 2).sum(axis=1)
+    contacts = robot["contacts"][: robot["n_contacts"]]
+    load_n = mass_kg * GRAVITY_MPS2 * contacts["load_fraction"]
+    spin = contacts["radius_m"] ** 2 / robot["wheel_inertia_kgm2"]
+    arm_m2 = (contacts["x_m"] - robot["com_m"][0]) ** 2 + (contacts["y_m"] - robot["com_m"][1]) ** 2
     body, rates_ps2 = 2.0 / mass_kg + arm_m2 / robot["yaw_inertia_kgm2"], []
     for ground in profile.patches["ground"]:  # the thrust over its slip is steepest at the start of the curve
         slope_n = np.array([wheel_ground(ground, load, _SMALL_SLIP, 0.0)[0] for load in load_n]) / _SMALL_SLIP
         stiffness_npm = slope_n / robot["relaxation_length_m"]
-        rates_ps2.append((stiffness_npm * spin).max() + (stiffness_npm * body).sum())
+        wheels = np.bincount(contacts["wheel"], stiffness_npm * spin)  # contacts of a wheel push it together
+        rates_ps2.append(wheels.max() + (stiffness_npm * body).sum())
     contact = LOAD_MARGIN_RATIO * float(np.max(rates_ps2)) / CONTACT_LIMIT_PS2
     damped = STEP_S * robot["tyre_stiffness_npm"] + 2.0 * robot["tyre_damping_nspm"]
-    tyre = STEP_S * damped / 4.0 / (mass_kg * float(robot["load_fraction"].min()))
+    tyre = STEP_S * damped / 4.0 / (mass_kg * float(contacts["load_fraction"].min()))
     steps = f"robot {name}: its motion cannot be integrated in steps of {STEP_S:g} s: "
     if not contact <= 1.0:
         raise ConfigError(
@@ -326,7 +395,7 @@ def settle(plant: Array, profile: TerrainProfile, state: Array) -> None:
     nothing. For four of five seconds the speeds are taken away ten times a second, so that it does not swing;
     where it rests afterwards is the origin.  Terrain too steep to stand on lets it slide.
     """
-    still, rows = np.zeros((100, 3)), np.empty(100, BODY_ROW)
+    still, rows = np.zeros((100, plant["n_contacts"][0])), np.empty(100, BODY_ROW)
     for tenth in range(50):
         advance(plant, profile, state, still, still, still, rows)
         if tenth < 40:
@@ -351,8 +420,8 @@ def advance(
     ----------
     plant, profile, state : as :func:`make_plant`, :func:`draw_profile` and :func:`start_state` give them; or a state as
         an earlier call left it
-    wheel_radps, steer_rad : (n, 3) commands
-    road_noise : (n, 3) standard normal numbers, the roughness under each wheel
+    wheel_radps, steer_rad : (n, wheels) commands
+    road_noise : (n, contacts) standard normal numbers, the roughness under each contact
     rows : (n,) of :data:`~terrain.simulation.sensors.BODY_ROW`, is written
     """
     for k in range(rows.size):
@@ -381,7 +450,7 @@ def step(
     force_x, force_y, moment, leg_nm = 0.0, 0.0, 0.0, 0.0
     com_x, com_y, sigma_m = plant.com_m[0], plant.com_m[1], plant.relaxation_length_m
     cell = min(max(int(state.path_m / FIELD_STEP_M), 0), profile.field.shape[2] - 1)  # a NaN is no place
-    for i in range(3):
+    for i in range(plant.n_wheels):
         w, out, radius_m = state.wheels[i], row.wheels[i], plant.radius_m[i]
         _steer_wheel(plant, w, steer_rad[i], dt)
         heading = row.encoder_rad[i] = w.steer_rad
@@ -398,83 +467,125 @@ def step(
             heading = w.heading_rad + plant.steer_offset_rad[i]
         if i == 2 and plant.leg_backlash_rad > 0.0:
             heading += state.leg_rad
-        # speed of the wheel's centre, along the wheel and across it
         x_m, y_m = plant.wheels_m[i, 0] - com_x, plant.wheels_m[i, 1] - com_y
+        v_x, v_y = point_velocity(state.speed_x_mps, state.speed_y_mps, state.yaw_rate_radps, x_m, y_m)
+        roller = plant.wheel_roller_rad[i]
+        axis = heading + plant.wheel_direction_rad[i] + roller
+        cos, sin, wheel_speed = math.cos(axis), math.sin(axis), w.rate_radps * radius_m
+        along, across = cos * v_x + sin * v_y, -sin * v_x + cos * v_y
+        along /= math.cos(roller)  # the speed at which the wheel would roll without slip
+        fastest = max(abs(wheel_speed), abs(along))
+        out.wheel_radps, out.steer_rad = wheel_speed / radius_m, heading  # of this instant, as the slip is
+        out.slip_ratio = (wheel_speed - along) / fastest if fastest >= 0.05 else np.nan
+        out.slip_angle_rad = math.atan2(across, abs(along)) if math.hypot(along, across) >= 0.05 else np.nan
+        out.normal_n = out.traction_n = out.side_n = out.sinkage_m = w.load_nm = w.spread_nm = 0.0
+        out.patch_ratio = -1.0
+    for c in range(plant.n_contacts):
+        at, t = plant.contacts[c], state.contacts[c]
+        i = at.wheel
+        w, out, radius_m = state.wheels[i], row.wheels[i], at.radius_m
+        heading = out.steer_rad
+        if at.ackermann_m > 0.0:  # all tyres of the axle roll about one centre
+            about_m = at.ackermann_m * math.cos(heading) - at.y_m * math.sin(heading)
+            heading = math.atan2(at.ackermann_m * math.sin(heading), about_m)
+        heading += at.direction_rad + at.roller_rad
+        # speed of the contact, along the wheel and across it, or along the axis of its rollers and across that
+        x_m, y_m = at.x_m - com_x, at.y_m - com_y
         v_x, v_y = point_velocity(state.speed_x_mps, state.speed_y_mps, state.yaw_rate_radps, x_m, y_m)
         cos_steer, sin_steer = math.cos(heading), math.sin(heading)
         along = cos_steer * v_x + sin_steer * v_y
         across = -sin_steer * v_x + cos_steer * v_y
-        drift_x = state.drift_x_mps - plant.wheels_m[i, 1] * state.drift_radps
-        drift_y = state.drift_y_mps + plant.wheels_m[i, 0] * state.drift_radps
+        drift_x = state.drift_x_mps - at.y_m * state.drift_radps
+        drift_y = state.drift_y_mps + at.x_m * state.drift_radps
         drift_along = cos_steer * drift_x + sin_steer * drift_y
-        wheel_speed = w.rate_radps * radius_m
-        fastest = max(abs(wheel_speed), abs(along))
-        # the patch that the wheel is on lies ahead of the body's by its place in the direction of motion
+        wheel_speed = (w.rate_radps + at.side_ratio * w.spread_radps) * radius_m
+        cos_roller, sin_roller = math.cos(at.roller_rad), math.sin(at.roller_rad)
+        pulled = wheel_speed * cos_roller
+        fastest = max(abs(wheel_speed), math.hypot(along, across) if plant.skids else abs(along))
+        # the patch that the contact is on lies ahead of the body's by its place in the direction of motion
         speed = (
             math.sqrt(state.speed_x_mps * state.speed_x_mps + state.speed_y_mps * state.speed_y_mps) + 1e-9
         )
-        ahead_m = (
-            plant.wheels_m[i, 0] * state.speed_x_mps + plant.wheels_m[i, 1] * state.speed_y_mps
-        ) / speed
+        ahead_m = (at.x_m * state.speed_x_mps + at.y_m * state.speed_y_mps) / speed
         at_m, patch = state.path_m + (ahead_m if speed > 0.05 else 0.0), 0
         while patch + 1 < profile.patches.size and at_m >= profile.patches[patch + 1].start_m:
             patch += 1
         ground = profile.patches[patch].ground
         rolled = math.sqrt(along * along + across * across)
-        ride_n = _ride_over(plant, w, i, profile.patches[patch].roughness_m3, rolled, noise[i], dt)
+        ride_n = _ride_over(plant, at, t, profile.patches[patch].roughness_m3, rolled, noise[c], dt)
         normal_n = plant.mass_kg * (
-            GRAVITY_MPS2 / steepness * plant.load_fraction[i]
-            + plant.load_per_force_ratio[i, 0] * (state.accel_x_mps2 + GRAVITY_MPS2 * grade_x / steepness)
-            + plant.load_per_force_ratio[i, 1] * (state.accel_y_mps2 + GRAVITY_MPS2 * grade_y / steepness)
+            GRAVITY_MPS2 / steepness * at.load_fraction
+            + at.load_per_force_ratio[0] * (state.accel_x_mps2 + GRAVITY_MPS2 * grade_x / steepness)
+            + at.load_per_force_ratio[1] * (state.accel_y_mps2 + GRAVITY_MPS2 * grade_y / steepness)
         )
-        w.ride_mps2 = ride_n / (plant.mass_kg * plant.load_fraction[i])
+        t.ride_mps2 = ride_n / (plant.mass_kg * at.load_fraction)
         normal_n = max(normal_n + ride_n, 0.0)
-        rate_x = wheel_speed - along + drift_along - fastest / sigma_m * w.deflection_x_m
-        rate_y = cos_steer * drift_y - sin_steer * drift_x - across - fastest / sigma_m * w.deflection_y_m
+        rate_x = pulled - along + drift_along - fastest / sigma_m * t.deflection_x_m
+        rate_y = cos_steer * drift_y - sin_steer * drift_x - across - fastest / sigma_m * t.deflection_y_m
         if plant.yields:
-            rate_x -= w.creep_ratio * fastest / sigma_m * w.deflection_x_m
+            rate_x -= t.creep_ratio * fastest / sigma_m * t.deflection_x_m
             rate_y -= plant.effects.side_hill_slip_ratio * math.atan(grade_y) * abs(along)
-        slip_x = (w.deflection_x_m + DEFLECTION_DAMPING_S * rate_x) / sigma_m
-        slip_y = (w.deflection_y_m + DEFLECTION_DAMPING_S * rate_y) / sigma_m
+        slip_x = (t.deflection_x_m + DEFLECTION_DAMPING_S * rate_x) / sigma_m
+        slip_y = (t.deflection_y_m + DEFLECTION_DAMPING_S * rate_y) / sigma_m
+        if plant.rollers:  # they turn freely across their axis, against their own friction
+            turning = across + wheel_speed * sin_roller
+            slip_y = 0.0
         thrust, side, resistance, sinkage = wheel_ground(
             ground, normal_n, min(max(slip_x, -1.0), 1.0), slip_y
         )
-        thrust *= profile.field[0, i, cell]
-        side *= profile.field[0, i, cell]
-        resistance *= profile.field[1, i, cell]
+        thrust *= profile.field[0, c, cell]
+        side *= profile.field[0, c, cell]
+        resistance *= profile.field[1, c, cell]
+        if plant.rollers:
+            friction = profile.patches[patch].roller_friction_ratio * normal_n
+            side = -friction * turning / max(fastest, ROLLING_SPEED_MPS)
         if plant.yields:
-            w.creep_ratio = _creep(plant, ground, normal_n, slip_x, thrust)
-            slip = abs(slip_x) * (1.0 + w.creep_ratio)
+            t.creep_ratio = _creep(plant, ground, normal_n, slip_x, thrust)
+            slip = abs(slip_x) * (1.0 + t.creep_ratio)
             more = plant.effects.rolling_resistance_ratio + plant.effects.slip_resistance_ratio * slip
             resistance += more * normal_n
             resistance = max(resistance + plant.effects.viscous_drag_nspm * abs(along) / 3.0, 0.0)
-        pull = thrust - resistance * math.tanh(along / ROLLING_SPEED_MPS)
-        _drive_wheel(plant, w, wheel_radps[i], thrust * radius_m, dt)
-        # the contact follows with the wheel's new rate: semi-implicit
-        rate_x = w.rate_radps * radius_m - along + drift_along - fastest / sigma_m * w.deflection_x_m
-        deflection = w.deflection_x_m + dt * rate_x
-        if plant.yields:  # implicit: a contact that creeps fast is stiff
-            deflection /= 1.0 + dt * (w.creep_ratio * fastest / sigma_m)
-        w.deflection_x_m = min(max(deflection, -sigma_m), sigma_m)
-        w.deflection_y_m = min(max(w.deflection_y_m + dt * rate_y, -sigma_m), sigma_m)
-        out.wheel_radps, out.steer_rad = wheel_speed / radius_m, heading  # of this instant, as the slip is
-        out.slip_ratio = (wheel_speed - along) / fastest if fastest >= 0.05 else np.nan
-        out.slip_angle_rad = math.atan2(across, abs(along)) if math.hypot(along, across) >= 0.05 else np.nan
-        out.normal_n, out.traction_n, out.side_n, out.torque_nm = normal_n, thrust, side, w.torque_nm
-        out.sinkage_m, out.reported_radps, out.patch_ratio = sinkage, w.reported_radps, patch
-        f_x, f_y = cos_steer * pull - sin_steer * side, sin_steer * pull + cos_steer * side
+        # what resists acts at the axle, against the rolling of the wheel
+        against = resistance * math.tanh((cos_roller * along - sin_roller * across) / ROLLING_SPEED_MPS)
+        traction, aside = thrust * cos_roller - side * sin_roller, thrust * sin_roller + side * cos_roller
+        pull, side_n = thrust - against * cos_roller, side + against * sin_roller
+        w.load_nm += traction * radius_m
+        w.spread_nm += at.side_ratio * traction * radius_m
+        t.along_mps, t.drift_mps, t.fastest_mps = along, drift_along, fastest
+        t.deflection_y_m = min(max(t.deflection_y_m + dt * rate_y, -sigma_m), sigma_m)
+        out.normal_n += normal_n
+        out.traction_n += traction
+        out.side_n += aside
+        out.sinkage_m = max(out.sinkage_m, sinkage)
+        # of a wheel on two grounds none is the terrain
+        out.patch_ratio = patch if out.patch_ratio == -1.0 or out.patch_ratio == patch else -2.0
+        f_x, f_y = cos_steer * pull - sin_steer * side_n, sin_steer * pull + cos_steer * side_n
         if i == 2:
-            leg_nm = -plant.wheels_m[i, 1] * f_x
+            leg_nm = -at.y_m * f_x
         force_x += f_x
         force_y += f_y
         moment += x_m * f_y - y_m * f_x
+    for i in range(plant.n_wheels):
+        w, out = state.wheels[i], row.wheels[i]
+        _drive_wheel(plant, w, plant.driven[i] != 0, wheel_radps[i], dt)
+        out.torque_nm, out.reported_radps = w.torque_nm, w.reported_radps
+    for c in range(plant.n_contacts):
+        # the contact follows with the wheel's new rate: semi-implicit
+        at, t = plant.contacts[c], state.contacts[c]
+        w = state.wheels[at.wheel]
+        wheel_speed = (w.rate_radps + at.side_ratio * w.spread_radps) * at.radius_m * math.cos(at.roller_rad)
+        decay = t.fastest_mps / sigma_m
+        deflection = t.deflection_x_m + dt * (
+            wheel_speed - t.along_mps + t.drift_mps - decay * t.deflection_x_m
+        )
+        if plant.yields:  # implicit: a contact that creeps fast is stiff
+            deflection /= 1.0 + dt * (t.creep_ratio * decay)
+        t.deflection_x_m = min(max(deflection, -sigma_m), sigma_m)
     state.n_steps += 1
     accel_x = force_x / plant.mass_kg - GRAVITY_MPS2 * grade_x / steepness
     accel_y = force_y / plant.mass_kg - GRAVITY_MPS2 * grade_y / steepness
     spin, turn = moment / plant.yaw_inertia_kgm2, state.yaw_rate_radps
-    # speeds and accelerations at the origin; the ride of the plane through the three corners
-    base_m, track_m = plant.wheels_m[1, 0] - plant.wheels_m[0, 0], -plant.wheels_m[2, 1]
-    one, two, three = state.wheels[0], state.wheels[1], state.wheels[2]
+    # speeds and accelerations at the origin; the ride of the plane through the corners
     row.position_x_m, row.position_y_m, row.yaw_rad = state.position_x_m, state.position_y_m, state.yaw_rad
     row.speed_x_mps, row.speed_y_mps = point_velocity(
         state.speed_x_mps, state.speed_y_mps, turn, -com_x, -com_y
@@ -482,11 +593,16 @@ def step(
     row.yaw_rate_radps = turn
     row.accel_x_mps2 = accel_x + spin * com_y + turn * turn * com_x
     row.accel_y_mps2 = accel_y - spin * com_x + turn * turn * com_y
-    row.ride_z_mps2 = 0.5 * (one.ride_mps2 + two.ride_mps2)
-    row.ride_roll_rad = (0.5 * (one.ride_m + two.ride_m) - three.ride_m) / track_m
-    row.ride_pitch_rad = -(two.ride_m - one.ride_m) / base_m
-    row.ride_roll_radps2 = (0.5 * (one.ride_mps2 + two.ride_mps2) - three.ride_mps2) / track_m
-    row.ride_pitch_radps2 = -(two.ride_mps2 - one.ride_mps2) / base_m
+    row.ride_z_mps2 = row.ride_roll_rad = row.ride_pitch_rad = row.ride_roll_radps2 = (
+        row.ride_pitch_radps2
+    ) = 0.0
+    for c in range(plant.n_contacts):
+        at, t = plant.contacts[c], state.contacts[c]
+        row.ride_z_mps2 += at.ride_ratio * t.ride_mps2
+        row.ride_roll_rad += at.ride_roll_1pm * t.ride_m
+        row.ride_pitch_rad += at.ride_pitch_1pm * t.ride_m
+        row.ride_roll_radps2 += at.ride_roll_1pm * t.ride_mps2
+        row.ride_pitch_radps2 += at.ride_pitch_1pm * t.ride_mps2
     row.path_m, row.leg_rad = state.path_m, state.leg_rad
     # step the body with the acceleration of its centre of mass and of its yaw
     vx, vy = state.speed_x_mps, state.speed_y_mps
@@ -550,22 +666,22 @@ def _creep(plant: Any, ground: Any, normal_n: float, slip: float, thrust_n: floa
 
 @inner
 def _ride_over(
-    plant: Any, w: Any, i: int, roughness_m3: float, speed: float, noise: float, dt: float
+    plant: Any, at: Any, t: Any, roughness_m3: float, speed: float, noise: float, dt: float
 ) -> float:
     """Move the corner on its tyre over the rough ground; return what that adds to the load."""
     white = noise * math.sqrt(0.5 / dt)
-    w.road_m += dt * (
-        -2 * math.pi * ROUGHNESS_CUTOFF * speed * w.road_m
+    t.road_m += dt * (
+        -2 * math.pi * ROUGHNESS_CUTOFF * speed * t.road_m
         + 2 * math.pi * ROUGHNESS_WAVENUMBER * math.sqrt(roughness_m3 * speed) * white
     )
-    contact_rate = (w.road_m - w.contact_m) * min(2.0 * speed / plant.contact_length_m, 1.0 / dt)
-    w.contact_m += dt * contact_rate
-    mass_kg = plant.mass_kg * plant.load_fraction[i]
-    force_n = plant.tyre_stiffness_npm * (w.contact_m - w.ride_m) + plant.tyre_damping_nspm * (
-        contact_rate - w.ride_mps
+    contact_rate = (t.road_m - t.contact_m) * min(2.0 * speed / plant.contact_length_m, 1.0 / dt)
+    t.contact_m += dt * contact_rate
+    mass_kg = plant.mass_kg * at.load_fraction
+    force_n = plant.tyre_stiffness_npm * (t.contact_m - t.ride_m) + plant.tyre_damping_nspm * (
+        contact_rate - t.ride_mps
     )
-    w.ride_mps += dt * force_n / mass_kg
-    w.ride_m += dt * w.ride_mps
+    t.ride_mps += dt * force_n / mass_kg
+    t.ride_m += dt * t.ride_mps
     return float(force_n)
 
 
@@ -588,7 +704,7 @@ def _steer_wheel(plant: Any, w: Any, command_rad: float, dt: float) -> None:
 
 
 @inner
-def _drive_wheel(plant: Any, w: Any, command_radps: float, load_nm: float, dt: float) -> None:
+def _drive_wheel(plant: Any, w: Any, driven: bool, command_radps: float, dt: float) -> None:
     """Speed loop, motor and wheel; then the rate that the motor driver reports."""
     command = min(max(command_radps, -plant.speed_max_radps), plant.speed_max_radps)
     error = command - w.estimate_radps
@@ -598,7 +714,10 @@ def _drive_wheel(plant: Any, w: Any, command_radps: float, load_nm: float, dt: f
         w.integral_nm += dt * plant.speed_integral_nmpr * error
     w.torque_nm += (torque - w.torque_nm) * min(dt / max(plant.torque_time_constant_s, dt), 1.0)
     friction = plant.friction_nm * math.tanh(w.rate_radps / 0.1)
-    w.rate_radps += dt * (w.torque_nm - friction - load_nm) / plant.wheel_inertia_kgm2
+    if not driven:
+        w.torque_nm = w.integral_nm = friction = 0.0
+    w.rate_radps += dt * (w.torque_nm - friction - w.load_nm) / plant.wheel_inertia_kgm2
+    w.spread_radps -= dt * w.spread_nm / plant.wheel_inertia_kgm2
     w.angle_rad += dt * w.rate_radps
     lag = min(dt / max(plant.speed_estimate_time_constant_s, dt), 1.0)
     w.estimate_radps += (w.rate_radps - w.estimate_radps) * lag
@@ -615,13 +734,6 @@ MAX_WHEEL_SPEEDS = 100.0
 MAX_COMMAND_DELAY_S = 0.5  # longest delay of a command to the wheels; a later one is no control
 
 _PURPOSES = ("terrain", "road", "start", "wheels", "steering", "imu", "camera", "gnss")
-
-COMMAND_CHANNELS = (
-    *("speed_x_mps", "speed_y_mps", "yaw_rate_radps"),
-    *(f"wheel_{i}_radps" for i in (1, 2, 3)),
-    *(f"steer_{i}_rad" for i in (1, 2, 3)),
-)
-"""The admitted twist of the body, and what it asks of the wheels."""
 
 
 def run_dynamic(
@@ -641,7 +753,7 @@ def run_dynamic(
 
     Parameters
     ----------
-    robot : swerve robot with all sections
+    robot : of any drive; sections that it lacks are those of :func:`~terrain.simulation.assumed.with_assumed`
     soils : by the terrain names of the scenario
     gnss : receiver on board, if any
     controller : called once an instant of the scenario with the samples that arrived since the instant before, as the
@@ -649,18 +761,23 @@ def run_dynamic(
         at 0.  Without one the wheels are commanded to follow the desired twists
     command_delay_s : from that instant to when the command is in force, in whole steps, one at least
     """
-    robot = as_drive(SwerveRobot, robot, "robot {name}: drive {drive!r} is not simulated, only 'swerve' is")
+    robot = with_assumed(robot)
+    if not isinstance(robot, SwerveRobot) and (effects or robot.effects or robot.learned):
+        raise ConfigError(
+            f"robot {robot.name}: effects and learned terms of the drive {robot.drive!r} act on a planar ground, not "
+            "on soils"
+        )
     substeps = round(1 / (scenario.rate_hz * STEP_S))
     if abs(substeps * scenario.rate_hz * STEP_S - 1.0) > 1e-9:
         raise ConfigError(
             f"scenario {scenario.name}: rate_hz is {scenario.rate_hz:g}, it must divide {1 / STEP_S:g}"
         )
-    on_board = {"camera": robot.camera, "sensors": robot.sensors}
-    for section, part in on_board.items():
+    for section in ("camera", "sensors"):
+        on_board = robot.parts.get(section)
         for name in ("rate_hz", "wheels_rate_hz", "steering_rate_hz", "imu_rate_hz"):
-            if getattr(part, name, 0.0) > 1 / STEP_S:
+            if getattr(on_board, name, 0.0) > 1 / STEP_S:
                 raise ConfigError(
-                    f"robot {robot.name}: {section}: {name} is {getattr(part, name):g}, "
+                    f"robot {robot.name}: {section}: {name} is {getattr(on_board, name):g}, "
                     f"at most {1 / STEP_S:g} is simulated"
                 )
     is_number = isinstance(command_delay_s, int | float | np.integer | np.floating)
@@ -677,20 +794,21 @@ def run_dynamic(
     plant = make_plant(built, conditions)
     check_step(plant, profile, built.name)
     n_steps = len(scenario.time_s) * substeps
-    state = start_state(plant["dead_band_rad"][0] * rngs["start"].uniform(-1.0, 1.0, 3))
+    n_wheels, n_contacts = len(robot.wheels), int(plant["n_contacts"][0])
+    state = start_state(plant["dead_band_rad"][0] * rngs["start"].uniform(-1.0, 1.0, n_wheels))
     settle(plant, profile, state)
-    road_noise = rngs["road"].standard_normal((n_steps, 3))
+    road_noise = rngs["road"].standard_normal((n_steps, n_contacts))
     motion = Motion(np.empty(n_steps, BODY_ROW), 0)
     rows = motion.record
     imu, gyro_bias_radps = sensing.imu_sensor(motion, built, rngs["imu"])
-    sensors = {
-        "wheels": sensing.wheel_sensor(motion, built, rngs["wheels"]),
-        "steering": sensing.steering_sensor(motion, built, rngs["steering"]),
-        "imu": imu,
-        "odometry": sensing.camera_sensor(motion, built, rngs["camera"], faults),
-    }
+    sensors = {"wheels": sensing.wheel_sensor(motion, built, rngs["wheels"])}
+    if robot.steered:
+        sensors["steering"] = sensing.steering_sensor(motion, built, rngs["steering"])
+    sensors["imu"] = imu
+    if robot.describes("camera"):
+        sensors["odometry"] = sensing.camera_sensor(motion, built, rngs["camera"], faults)
     if gnss is not None:
-        sensors["gnss"] = sensing.gnss_sensor(motion, gnss, rngs["gnss"])
+        sensors["gnss"] = sensing.gnss_sensor(motion, built, gnss, rngs["gnss"])
     for name, sensor in sensors.items():
         stamped = on_samples(name, (), built.effects)(sensor.time_s.copy(), sensor.values)
         sensor.stamp_s = read_only(stamped[0])
@@ -700,7 +818,7 @@ def run_dynamic(
 
     def drift() -> None:
         """Let the contacts of the next steps move by what was learned of the motion, as the wheels roll now."""
-        wheels, inputs = state["wheels"][0], np.zeros((1, len(INPUTS)))
+        wheels, inputs = state["wheels"][0, :n_wheels], np.zeros((1, len(INPUTS)))
         speed = wheels["rate_radps"] * robot.wheel_radius_m
         inputs[:, :3] = rolled_twist(robot, speed[None], wheels["steer_rad"][None])
         change = rolling_change(robot.learned, inputs, np.array([1.0 / scenario.rate_hz]), lags)[0]
@@ -715,11 +833,14 @@ def run_dynamic(
             part = slice(begin, begin + every)
             if robot.learned:
                 drift()
-            given = held[part, 3:6].copy(), held[part, 6:].copy(), road_noise[part]
+            given = held[part, 3 : 3 + n_wheels].copy(), held[part, 3 + n_wheels :].copy(), road_noise[part]
             advance(plant, profile, state, *given, rows[part])
     else:
-        decided, delay_steps = np.empty((len(scenario.time_s), 9)), max(round(command_delay_s / STEP_S), 1)
-        wheel_radps, steer_rad = np.zeros((n_steps, 3)), np.zeros((n_steps, 3))  # in force at each step
+        decided, delay_steps = (
+            np.empty((len(scenario.time_s), 3 + 2 * n_wheels)),
+            max(round(command_delay_s / STEP_S), 1),
+        )
+        wheel_radps, steer_rad = np.zeros((2, n_steps, n_wheels))  # in force at each step
         done = 0
         for k, time_s in enumerate(scenario.time_s.tolist()):
             step = k * substeps
@@ -735,20 +856,25 @@ def run_dynamic(
                 sensor.update()
             arrived = ((name, sensor.arrived(time_s)) for name, sensor in sensors.items())
             readings = {name: reading for name, reading in arrived if reading is not None}
-            one, two, three = rows["wheels"]["patch_ratio"][step].tolist()
-            terrain = scenario.patches[int(one)].terrain if one == two == three else ""
+            grounds = set(rows["wheels"]["patch_ratio"][step, :n_wheels].tolist())
+            terrain = (
+                scenario.patches[int(*grounds)].terrain if len(grounds) == 1 and min(grounds) >= 0 else ""
+            )
             command = controller(Sample(time_s, scenario.twist[k], readings, terrain))
-            decided[k], row_status = _checked(command, status[0] if status else None, time_s)
+            decided[k], row_status = _checked(command, n_wheels, status[0] if status else None, time_s)
             status.append(row_status)
             in_force = slice(step + delay_steps, step + delay_steps + substeps)
-            wheel_radps[in_force], steer_rad[in_force] = decided[k, 3:6], decided[k, 6:]
+            wheel_radps[in_force], steer_rad[in_force] = (
+                decided[k, 3 : 3 + n_wheels],
+                decided[k, 3 + n_wheels :],
+            )
         else:
             part = slice(done, n_steps)
             advance(plant, profile, state, wheel_radps[part], steer_rad[part], road_noise[part], rows[part])
-    later = ("wheels", "roll_rad", "pitch_rad")
+    later = ("wheels", "encoder_rad", "roll_rad", "pitch_rad")
     finite = all(np.isfinite(rows[name]).all() for name in BODY_ROW.names or () if name not in later)
     limit_radps = MAX_WHEEL_SPEEDS * robot.motors.speed_max_radps
-    if not finite or not np.abs(rows["wheels"]["wheel_radps"]).max() <= limit_radps:
+    if not finite or not np.abs(rows["wheels"]["wheel_radps"][:, :n_wheels]).max() <= limit_radps:
         raise ConfigError(
             f"robot {robot.name}: its motion cannot be integrated in steps of {STEP_S:g} s; a mass, an "
             "inertia, a stiffness, a gain or the load is out of scale with the rest"
@@ -758,14 +884,16 @@ def run_dynamic(
     for sensor in sensors.values():
         sensor.update()
     streams = {name: sensor.stream() for name, sensor in sensors.items() if len(sensor.time_s) > 1}
-    streams["commands"] = Stream(scenario.time_s, decided, COMMAND_CHANNELS)
+    steers = len(robot.steer_rows)  # steered wheels are the first ones
+    channels = (*TWIST, *sensing.wheel_channels("wheel_radps", robot.wheels), *robot.steer_rows)
+    streams["commands"] = Stream(scenario.time_s, decided[:, : 3 + n_wheels + steers], channels)
     if status and status[0]:
         table = np.array([[row[name] for name in status[0]] for row in status])
         streams["control"] = Stream(scenario.time_s, table, tuple(status[0]))
-    streams["truth"] = dynamic_truth(motion, gyro_bias_radps, imu.time_s)
-    # one label a stretch in which all three wheels are on the same ground
+    streams["truth"] = dynamic_truth(motion, robot, gyro_bias_radps, imu.time_s)
+    # one label a stretch in which all wheels are on the same ground
     labels: list[Label] = []
-    under = rows["wheels"]["patch_ratio"]
+    under = rows["wheels"]["patch_ratio"][:, :n_wheels]
     under = np.where((under == under[:, :1]).all(axis=1), under[:, 0], -1)
     edges = np.concatenate([[0], np.flatnonzero(np.diff(under)) + 1, [n_steps]])
     for begin, end in pairwise(edges.tolist()):
@@ -783,36 +911,36 @@ _WHEEL_TRUTH = (
 )
 
 
-def dynamic_truth(motion: Motion, gyro_bias_radps: Array, gyro_time_s: Array) -> Stream:
-    """Return the truth of a motion at 100 Hz, a compromise with the size of files.
+def dynamic_truth(motion: Motion, robot: Robot, gyro_bias_radps: Array, gyro_time_s: Array) -> Stream:
+    """Return the truth of a robot's motion at 100 Hz, a compromise with the size of files.
 
     A slip that is never defined has no channel.
     """
     time_s, at = motion.at(sensing.TRUTH_HZ)
     rows = motion.record[at]
-    of_wheels = {name: rows["wheels"][name] for name in _WHEEL_TRUTH}
+    of_wheels = {name: rows["wheels"][name][:, : len(robot.wheels)] for name in _WHEEL_TRUTH}
     bias = {sensing.GYRO_BIAS: np.interp(time_s, gyro_time_s, gyro_bias_radps)}
-    truth = sensing.truth_stream(time_s, rows, "123", of_wheels, bias)
+    truth = sensing.truth_stream(time_s, rows, robot.wheels, of_wheels, bias)
     known = np.asarray(np.isfinite(truth.values).any(axis=0))
     channels = tuple(name for name, keep in zip(truth.channels, known, strict=True) if keep)
     return Stream(time_s, truth.values[:, known], channels)
 
 
 def _checked(
-    command: Command, first: Mapping[str, float] | None, time_s: float
+    command: Command, wheels: int, first: Mapping[str, float] | None, time_s: float
 ) -> tuple[Array, dict[str, float]]:
-    """Return twist, wheel rates and steering angles of a command in a row (9,), and its status as the first one's."""
-    row, where = np.empty(9), f"of its command at {time_s:g} s"
-    for i, name in enumerate(("twist", "wheel_radps", "steer_rad")):
+    """Return twist, wheel rates and steering angles of a command in a row, and its status as the first one's."""
+    row, where = np.empty(3 + 2 * wheels), f"of its command at {time_s:g} s"
+    for name, begin, n in (("twist", 0, 3), ("wheel_radps", 3, wheels), ("steer_rad", 3 + wheels, wheels)):
         given = getattr(command, name)
         try:
             values = np.asarray(given, dtype=float)
         except (TypeError, ValueError):
             values = np.empty(0)
-        if values.shape != (3,) or not np.isfinite(values).all():
+        if values.shape != (n,) or not np.isfinite(values).all():
             shown = " ".join(repr(given).split())
-            raise DataError(f"controller: {name} {where} is {shown}, 3 finite numbers are required")
-        row[3 * i : 3 * i + 3] = values
+            raise DataError(f"controller: {name} {where} is {shown}, {n} finite numbers are required")
+        row[begin : begin + n] = values
     try:
         status = {name: float(value) for name, value in command.status.items()}
         for name in status if first is None else ():

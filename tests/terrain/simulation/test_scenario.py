@@ -195,7 +195,6 @@ def test_a_course_is_driven_over_every_terrain_in_a_drawn_order_a_long_one_again
         *(({"accel_mps2": value}, f"accel_mps2 is {value!r}") for value in (math.nan, "fast")),
         *(({"seed": value}, f"seed is {value}, a whole number from 0 up") for value in (-3, None)),
         ({"robot": HUSKY, "name": "crab"}, "scenario 'crab' is not for robot husky"),
-        ({"robot": HUSKY, "name": "course"}, "scenario 'course' is not for robot husky"),
         ({"robot": ROBOT.without("motors")}, "no section 'motors'"),
     ],
 )

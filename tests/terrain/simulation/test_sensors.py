@@ -49,10 +49,12 @@ def motion_of(duration_s, **columns):
     """Return a motion that is 0 but for the columns given: numbers, (n,) or, for wheels, (n, 3) arrays."""
     record = np.zeros(round(duration_s / STEP_S), BODY_ROW)
     for name, values in columns.items():
-        of = record if name in BODY_ROW.names else record["wheels"]
-        of[name] = values
+        if name in BODY_ROW.names:
+            record[name] = values
+        else:
+            record["wheels"][name][:, :3] = values
         if name == "steer_rad":
-            record["encoder_rad"] = values
+            record["encoder_rad"][:, :3] = values
     return Motion(record)
 
 
@@ -78,8 +80,8 @@ def camera_stream(*given):
     return stream_of(camera_sensor(*given))
 
 
-def gnss_stream(*given):
-    return stream_of(gnss_sensor(*given))
+def gnss_stream(motion, *given):
+    return stream_of(gnss_sensor(motion, ROBOT, *given))
 
 
 def clock(duration_s):
@@ -137,7 +139,7 @@ def test_a_motion_in_blocks_gives_the_bytes_of_the_motion_in_one(cuts):
                 *(make(motion, robot, rng()) for make in (wheel_sensor, steering_sensor)),
                 imu_sensor(motion, robot, rng())[0],
                 camera_sensor(motion, robot, rng(), faults),
-                gnss_sensor(motion, receiver, rng()),
+                gnss_sensor(motion, ROBOT, receiver, rng()),
             ]
             for motion in (whole, parts)
         )
@@ -205,7 +207,7 @@ def test_a_bias_walks_and_the_yaw_drifts_with_it():
     assert abs(drift[-1]) > 0.05
     # it begins at 0, whatever the heading
     assert_std(imu.channel("yaw_rad") - drift, sensors.yaw_std_rad, 0.0)
-    truth = dynamic_truth(motion_of(100.0), bias, imu.time_s)
+    truth = dynamic_truth(motion_of(100.0), ROBOT, bias, imu.time_s)
     np.testing.assert_allclose(truth.channel("gyro_bias_z_radps"), bias, rtol=0, atol=1e-15)
 
 
@@ -355,7 +357,7 @@ def test_the_truth_is_what_happened_and_a_slip_that_never_was_is_no_channel():
     slip = np.column_stack([np.full(500, np.nan), np.linspace(0.0, 0.5, 500), np.full(500, 0.1)])
     tilt = {"ride_roll_rad": 0.01, "grade_y_ratio": 0.1, "accel_y_mps2": 0.3}
     motion = motion_of(0.5, slip_ratio=slip, normal_n=[[1.0, 2.0, 3.0]], torque_nm=[[6.0, 0.0, -6.0]], **tilt)
-    truth = dynamic_truth(motion, np.array([0.1, 0.2]), np.array([0.0, 0.5]))
+    truth = dynamic_truth(motion, ROBOT, np.array([0.1, 0.2]), np.array([0.0, 0.5]))
     assert "slip_1_ratio" not in truth.channels
     np.testing.assert_array_equal(truth.channel("slip_2_ratio"), slip[::10, 1])
     assert [truth.channel(f"normal_{i}_n")[7] for i in (1, 2, 3)] == [1.0, 2.0, 3.0]

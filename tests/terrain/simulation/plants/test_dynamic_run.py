@@ -116,8 +116,10 @@ def test_terrain_varies_along_the_path_as_soil_and_conditions_state():
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"robot": load_robot("husky")}, "robot husky: drive 'skid_steer' is not simulated"),
-        ({"robot": ROBOT.without("camera")}, "robot agrimaro: .* no section 'camera'"),
+        (
+            {"robot": load_robot("husky"), "effects": {"payload_ratio": 0.1}},
+            "robot husky: effects and learned terms of the drive 'skid_steer' act on a planar ground",
+        ),
         ({"ground": {"tiles": SOILS["tiles"]}}, "scenario straight: terrain 'grass' has no soil"),
         ({"conditions": Conditions(payload_kg=300.0, payload_m=(0.6, 0.0))}, "tips it over: wheel 1 would"),
         (

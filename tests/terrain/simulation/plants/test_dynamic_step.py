@@ -44,12 +44,17 @@ class Driven(NamedTuple):
     profile: TerrainProfile
 
     def __getattr__(self, name):
-        return self.plant[name][0]
+        contacts = self.plant["contacts"][0, :3]
+        value = contacts[name] if name in contacts.dtype.names else self.plant[name][0]
+        return value[:3] if name in ("wheels_m", "radius_m") else value
 
     def changed(self, **numbers):
         plant, patches = self.plant.copy(), self.profile.patches.copy()
         for name, value in numbers.items():
-            (patches if name == "roughness_m3" else plant)[name] = value
+            if name == "load_per_force_ratio":
+                plant["contacts"][name][0, :3] = value
+            else:
+                (patches if name == "roughness_m3" else plant)[name] = value
         return Driven(plant, self.profile._replace(patches=patches))
 
 
@@ -79,7 +84,7 @@ def drive(plant, wheel_radps, steer_rad=None, seed=None, settled=False, substeps
 
 
 def wheels(motion):
-    return motion.record["wheels"]
+    return motion.record["wheels"][:, :3]
 
 
 def ramp(duration_s, radps=5.0):
@@ -222,6 +227,7 @@ def test_a_drive_with_everything_in_it_is_that_of_the_plain_form():
     rows, state = np.empty(len(noise), BODY_ROW), start_state(np.full(3, 0.015))
     held = (np.repeat(commands, SUBSTEPS, axis=0) for commands in (wheel, steer))
     advance(*plant, state, *held, noise, rows)
+    of_wheel = rows["wheels"][:, :3]
     assert plain["path"][-1] > 0.7  # on all three grounds
     assert np.ptp(rows["leg_rad"]) > 0.03  # and through its play
     commanded_nm = np.abs(plain["asked"])  # at the limit, where the integral is kept, and below it
@@ -237,9 +243,9 @@ def test_a_drive_with_everything_in_it_is_that_of_the_plain_form():
     )
     for name, found, expected in (
         *((name, rows[name], plain[twin]) for name, twin in (("yaw_rad", "yaw"), ("path_m", "path"))),
-        *((name, rows["wheels"][name], plain[twin]) for name, twin in of_wheels),
-        ("patches", rows["wheels"]["patch_ratio"], plain["patch"]),
-        ("rates as reported", rows["wheels"]["reported_radps"][:-1], plain["reported"][1:]),
+        *((name, of_wheel[name], plain[twin]) for name, twin in of_wheels),
+        ("patches", of_wheel["patch_ratio"], plain["patch"]),
+        ("rates as reported", of_wheel["reported_radps"][:-1], plain["reported"][1:]),
         ("yaw rate", turn, plain["turn"]),
         ("speed of the origin", along, plain["speed_x"] + plain["turn"] * plant.com_m[1]),
         ("speed to its left", across, plain["speed_y"] - plain["turn"] * plant.com_m[0]),
@@ -266,9 +272,15 @@ def test_steady_slip_is_that_at_which_a_wheel_pulls_its_share_of_the_hill(name, 
 
 def test_at_rest_on_the_level_nothing_at_all_happens():
     plant = plant_of(load_soil("grass"), roughness_m3=1e-3, backlash_rad=0.02)
-    rows = drive(plant, np.zeros((100, 3)), seed=0).record
-    assert len({row.tobytes() for row in rows}) == 1
-    assert np.isnan([rows["wheels"]["slip_ratio"], rows["wheels"]["slip_angle_rad"]]).all()
+    motion = drive(plant, np.zeros((100, 3)), seed=0)
+    rows, of_wheels = motion.record, wheels(motion)
+    bodies = rows[[name for name in rows.dtype.names if name not in ("wheels", "encoder_rad")]]
+    assert (
+        len({row.tobytes() for row in of_wheels})
+        == len({row.tobytes() for row in np.array(bodies.tolist())})
+        == 1
+    )
+    assert np.isnan([of_wheels["slip_ratio"], of_wheels["slip_angle_rad"]]).all()
     state = start_state(np.zeros(3))
     settle(*plant_of(load_soil("grass")), state)
     state["n_steps"] = 0
@@ -288,7 +300,7 @@ def test_a_robot_at_rest_on_a_slope_of_5_degrees_does_not_move(name, uphill_rad)
     assert np.abs(rows["yaw_rad"]).max() < 1e-3
     assert max(np.abs(rows[name]).max() for name in ("accel_x_mps2", "accel_y_mps2")) < 0.02
     weight_n = 90 * GRAVITY_MPS2 * math.cos(math.radians(5.0))
-    np.testing.assert_allclose(rows["wheels"]["normal_n"].sum(axis=1), weight_n)
+    np.testing.assert_allclose(rows["wheels"]["normal_n"][:, :3].sum(axis=1), weight_n)
 
 
 @pytest.mark.parametrize("leg_backlash_rad", [0.0, 0.03])
@@ -298,7 +310,7 @@ def test_motor_work_in_curves_is_dissipated_by_lateral_slip_too(leg_backlash_rad
     steer = np.clip(0.8 * np.sin(np.arange(400)[:, None] / 60), -0.5, 0.5) * [-1.0, 1.0, 0.4]
     rows = drive(plant, ramp(8.0, 7.0), steer, settled=True).record
     turn, names = rows["yaw_rate_radps"], ("steer_rad", "wheel_radps", "traction_n", "side_n", "normal_n")
-    heading, rate, thrust, side, normal = (rows["wheels"][name] for name in names)
+    heading, rate, thrust, side, normal = (rows["wheels"][name][:, :3] for name in names)
     x, y = ROBOT.wheel_positions_m.T
     centre_x = rows["speed_x_mps"][:, None] - turn[:, None] * y
     centre_y = rows["speed_y_mps"][:, None] + turn[:, None] * x
@@ -308,7 +320,7 @@ def test_motor_work_in_curves_is_dissipated_by_lateral_slip_too(leg_backlash_rad
     given, friction, rolling, slipping, sliding = (
         power_w.sum() * STEP_S
         for power_w in (
-            *(rows["wheels"]["torque_nm"] * rate, plant.friction_nm * np.tanh(rate / 0.1) * rate),
+            *(rows["wheels"]["torque_nm"][:, :3] * rate, plant.friction_nm * np.tanh(rate / 0.1) * rate),
             *(resistance * along, thrust * (0.2 * rate - along), side * -across),
         )
     )

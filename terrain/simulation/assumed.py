@@ -1,0 +1,165 @@
+"""What is assumed of a robot where its description has no figures: sections from geometry and mass.
+
+With the mass m, the wheel radius r, the wheelbase L, n wheels that a motor turns each and k contacts with the ground::
+
+    inertia        a box of the wheelbase and track with the wheels around them, m (l^2 + w^2) / 12; of a wheel and
+                   its rotor a tenth of its share of the mass at its radius
+    height         r + L / 10 of the centre of mass, in the middle of the contacts
+    tyres          half as wide as their radius, a contact of 0.6 r, relaxed over half of it; they sag by 0.025 r under
+                   m g / k, with 0.15 of the critical damping
+    motors         a torque of m g r / n, which slips every wheel; the top speed of a Froude number v^2 / (g L) of 0.25,
+                   that of a brisk walk; 3000 turns a minute there, at 5/6 of no load: k_t = V / w_0, with 24 V, from
+                   100 kg on 48 V; a speed loop of 9 rad/s on the share of the mass, integrating over 0.2 s
+    steering       2 rad/s, of a car-like robot as it is described
+    sensors        those of a common MEMS unit and of encoders on the motors
+
+The described robots of the package (0.04 to 0.2 m, 12 to 90 kg) are within a factor of about two of all these.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from terrain.constants import GRAVITY_MPS2
+from terrain.robots import KIND_OF_SECTION, BicycleRobot, Robot, TrackedRobot
+from terrain.simulation.contacts import TRACK_PATCHES, contacts_of
+
+SECTIONS = (
+    "body",
+    "motors",
+    "steering",
+    "sensors",
+)  # that a simulation needs; a camera is on board or is not
+SAG_RATIO, DAMPING_RATIO, FROUDE = 0.025, 0.15, 0.25
+ROTOR_SHARE, MOTOR_RADPS, NO_LOAD_RATIO, HEAVY_KG = 0.1, 314.0, 1.2, 100.0
+BANDWIDTH_RADPS, INTEGRAL_S = 9.0, 0.2
+FRICTION_RATIO, CURRENT_STD_RATIO = (
+    0.03,
+    0.005,
+)  # of motors and reductions, noise of a current: over the largest
+
+_INSTRUMENTS = {
+    "wheels_rate_hz": 50.0,
+    "hall_steps_ratio": 1024.0,
+    "encoder_time_constant_s": 0.0,
+    "motor_std_radps": 0.2,
+    "steering_rate_hz": 50.0,
+    "steering_steps_ratio": 4096.0,
+    "steering_std_rad": 0.001,
+    "imu_rate_hz": 100.0,
+    "imu_latency_s": 0.0,
+    "gyro_std_radps": 0.002,
+    "gyro_bias_std_radps": 0.002,
+    "gyro_walk_radps": 0.0001,
+    "accel_std_mps2": 0.02,
+    "accel_bias_std_mps2": 0.02,
+    "tilt_std_rad": 0.002,
+    "yaw_std_rad": 0.002,
+}
+
+
+def with_assumed(robot: Robot) -> Robot:
+    """Return a robot with all sections that a simulation needs; those that it lacks are in its ``assumed``.
+
+    Examples
+    --------
+    >>> from terrain.robots import SkidSteerRobot
+    >>> robot = with_assumed(SkidSteerRobot("mine", 0.165, 0.57, 0.512, 50.0))
+    >>> round(robot.motors.torque_max_nm), round(robot.body.tyre_stiffness_npm), "body.com_x_m" in robot.assumed
+    (40, 29717, True)
+    """
+    for name in SECTIONS:
+        if robot.describes(name) or (name == "steering" and not robot.steered):
+            continue
+        kind = KIND_OF_SECTION[name]
+        keys = kind.__dataclass_fields__
+        values = dict.fromkeys(keys, 0.0) | _NUMBERS[name](robot)
+        part: Any = kind(**{key: values[key] for key in keys})
+        assumed = robot.assumed | {f"{name}.{key}" for key in keys}
+        robot = replace(robot, parts={**robot.parts, name: part}, assumed=assumed)
+    return robot
+
+
+def _body(robot: Robot) -> dict[str, float]:
+    """Return the numbers of the section ``body``."""
+    radius_m, mass_kg, contacts = robot.wheel_radius_m, robot.mass_kg, contacts_of(robot)
+    places_m = np.array([contact[1:3] for contact in contacts])
+    com_x_m, com_y_m = places_m.mean(axis=0).tolist()
+    length_m, width_m = np.ptp(places_m, axis=0) + 2.0 * radius_m
+    share_kg, sag_m = mass_kg / len(contacts), SAG_RATIO * radius_m
+    stiffness_npm = share_kg * GRAVITY_MPS2 / sag_m
+    contact_m, tyre_m = (0.25 if robot.on_omni_wheels else 0.6) * radius_m, 0.5 * radius_m
+    numbers = {
+        "yaw_inertia_kgm2": mass_kg * (length_m**2 + width_m**2) / 12.0,
+        "com_height_m": radius_m + 0.1 * robot.wheelbase_m,
+        "contact_length_m": contact_m,
+        "tyre_width_m": tyre_m,
+    }
+    if isinstance(robot, TrackedRobot):
+        of_track = {
+            "contact_length_m": robot.wheelbase_m / TRACK_PATCHES,
+            "tyre_width_m": robot.track_width_m,
+        }
+        numbers |= of_track | {"com_height_m": robot.com_height_m}
+    if isinstance(robot, BicycleRobot):
+        com_x_m = robot.com_ahead_m
+        numbers |= {"yaw_inertia_kgm2": robot.yaw_inertia_kgm2, "com_height_m": robot.com_height_m}
+    return numbers | {
+        "footprint_min_m": robot.track_m + numbers["tyre_width_m"],
+        "footprint_max_m": robot.track_m + numbers["tyre_width_m"],
+        "com_x_m": com_x_m,
+        "com_y_m": com_y_m,
+        "wheel_inertia_kgm2": ROTOR_SHARE * mass_kg / len(robot.wheels) * radius_m**2,
+        "relaxation_length_m": numbers["contact_length_m"] / 2.0,
+        "tyre_stiffness_npm": stiffness_npm,
+        "tyre_damping_nspm": 2.0 * DAMPING_RATIO * math.sqrt(stiffness_npm * share_kg),
+    }
+
+
+def _motors(robot: Robot) -> dict[str, float]:
+    """Return the numbers of the section ``motors``."""
+    radius_m, n = robot.wheel_radius_m, len(robot.logged_wheels)
+    torque_nm = robot.mass_kg * GRAVITY_MPS2 * radius_m / n
+    speed_mps = math.sqrt(FROUDE * GRAVITY_MPS2 * robot.wheelbase_m)
+    speed_radps = getattr(robot, "speed_max_mps", speed_mps) / radius_m
+    supply_v = 24.0 if robot.mass_kg < HEAVY_KG else 48.0
+    gain = BANDWIDTH_RADPS * (robot.body.wheel_inertia_kgm2 + robot.mass_kg / n * radius_m**2)
+    return {
+        "reduction_ratio": MOTOR_RADPS / speed_radps,
+        "torque_constant_nmpa": supply_v / (NO_LOAD_RATIO * MOTOR_RADPS),
+        "efficiency_ratio": 0.75,
+        "torque_max_nm": torque_nm,
+        "supply_v": supply_v,
+        "speed_max_radps": speed_radps,
+        "torque_time_constant_s": 0.005,
+        "friction_nm": FRICTION_RATIO * torque_nm,
+        "speed_gain_nmspr": gain,
+        "speed_integral_nmpr": gain / INTEGRAL_S,
+        "speed_estimate_time_constant_s": 0.008,
+    }
+
+
+def _steering(robot: Robot) -> dict[str, float]:
+    """Return the numbers of the section ``steering``."""
+    rate_radps = robot.steering_rate_radps if isinstance(robot, BicycleRobot) else 2.0
+    lag_s = robot.steering_time_constant_s if isinstance(robot, BicycleRobot) else 0.1
+    accel_radps2 = rate_radps / max(lag_s, 0.01)
+    return {
+        "rate_max_radps": rate_radps,
+        "accel_max_radps2": accel_radps2,
+        "torque_max_nm": robot.motors.torque_max_nm,
+    }
+
+
+def _sensors(robot: Robot) -> dict[str, float]:
+    """Return the numbers of the section ``sensors``."""
+    most_a = robot.motors.torque_max_nm / robot.motors.nm_per_a
+    scales = {f"accel_scale_{axis}_ratio": 1.0 for axis in "xyz"}
+    return _INSTRUMENTS | scales | {"current_std_a": CURRENT_STD_RATIO * most_a}
+
+
+_NUMBERS = {"body": _body, "motors": _motors, "steering": _steering, "sensors": _sensors}
