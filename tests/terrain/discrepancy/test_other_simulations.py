@@ -205,7 +205,8 @@ def test_a_label_that_helps_no_run_changes_nothing():
 
 @pytest.mark.parametrize(("robot", "effective"), [(AGRIMARO, 0.0), (HUSKY, 1.0)])
 def test_tilt_acts_as_a_slope_but_not_where_a_body_rides_over_bumps(robot, effective):
-    runs = dynamic_runs(robot=robot, n=9, vary=robot is HUSKY, duration_s=30.0)
+    planar = {"effects": {}, "vary": True} if robot is HUSKY else {}
+    runs = dynamic_runs(robot=robot, n=9, duration_s=30.0, **planar)
     simulation, _ = simulation_for(runs, robot, library_of(robot.drive))
     ground = simulation.grounds.get("grass", Ground())
     assert ground.effective_ratio == pytest.approx(effective, abs=0.05)
