@@ -234,7 +234,7 @@ class Camera:
 
 @dataclass(frozen=True, slots=True)
 class Sensors:
-    """Rates, noise, bias and delay of all sensors but the camera.
+    """Rates, noise, bias, delay and bandwidth of all sensors but the camera.
 
     ``*_std`` are standard deviations of a sample while the robot stands still; ``*_bias_std`` of a bias from
     one power-on to the next; ``*_walk`` the random walk of a bias (per root second).
@@ -266,6 +266,15 @@ class Sensors:
     accel_scale_z_ratio: float
     tilt_std_rad: float
     yaw_std_rad: float
+    #: of the first-order low-pass inside the IMU; by default that of a Bosch BNO055 in its fusion modes (data sheet)
+    gyro_bandwidth_hz: float = 47.0
+    accel_bandwidth_hz: float = 62.5
+
+    @property
+    def imu_time_constants_s(self) -> tuple[float, float]:
+        """Time constants of the low-passes of gyro and accelerometer; 0 where the bandwidth is not known."""
+        gyro_s, accel_s = np.divide(0.5 / math.pi, [self.gyro_bandwidth_hz, self.accel_bandwidth_hz])
+        return float(np.nan_to_num(gyro_s)), float(np.nan_to_num(accel_s))
 
 
 @dataclass(frozen=True, slots=True)

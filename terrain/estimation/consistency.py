@@ -22,7 +22,7 @@ from scipy.special import chdtri
 
 from terrain.angles import wrapped
 from terrain.errors import DataError
-from terrain.estimation.filter import DEFAULT_SETTINGS, FilterModel
+from terrain.estimation.filter import DEFAULT_SETTINGS, FilterModel, process_noise
 from terrain.kinematics.logged_wheels import true_slip, wheel_and_ground_speed
 from terrain.records import GATED, USED, Array, RunLog, StateTrack
 from terrain.robots import Robot
@@ -158,8 +158,8 @@ def innovations(
         params = np.append(model.params, nothing if inputs is None else inputs[k])
         model.propagate(np.array(track.mean[k - 1]), dt_s, params, x_next, f)
         model.observe(x_next, params, z_hat, h)
-        process = model.process_variance + np.diag(np.zeros(d) if walk is None else walk[k])
-        predicted = f @ track.cov[k - 1] @ f.T + process * dt_s
+        noise = process_noise(model, dt_s, 0.0 if walk is None else walk[k])
+        predicted = f @ track.cov[k - 1] @ f.T + noise
         value[k] = z[k] - z_hat
         std[k] = np.sqrt(np.einsum("ij,jk,ik->i", h, predicted, h) + variance[k])
     is_angle = np.isin(model.rows, model.angle_rows)

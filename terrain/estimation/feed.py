@@ -304,12 +304,13 @@ def feed_settings(
         **options,
     )
     lag_s = robot.encoder_lag_s if ema_alpha is None else 0.0
+    own_s = {"gyro_z_radps": sensors.imu_time_constants_s[0], "odometry": camera.time_constant_s}
+    own_s |= dict.fromkeys(("accel_x_mps2", "accel_y_mps2"), sensors.imu_time_constants_s[1])
     for k, (name, signal) in enumerate(SIGNALS.items()):
-        limits = lag_s, period_s.get(signal.stream, math.nan), period_s["wheels"]
+        low_pass_s = max(lag_s - own_s.get(name, own_s.get(signal.stream, 0.0)), 0.0)
+        limits = low_pass_s, period_s.get(signal.stream, math.nan), period_s["wheels"]
         if k >= TILT:
             limits = 0.0, 0.02, 0.0
-        elif signal.stream == "odometry" and robot.describes("camera"):
-            limits = max(lag_s - camera.time_constant_s, 0.0), *limits[1:]
         judged = robot.steered or k >= TILT or name == "gyro_z_radps"
         settings["limits"][0, k] = _limit(*limits, signal if judged else Signal(signal.stream))
     return settings

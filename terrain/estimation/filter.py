@@ -2,12 +2,16 @@
 
 State x (d,) with covariance P, measurement z (m,) with independent rows of variance R, functions f and h::
 
-    predict       x <- f(x, dt)              P <- F P F' + Q dt                 F = df/dx
+    predict       x <- f(x, dt)              P <- F P F' + Q dt (+ integrals)   F = df/dx
     condition on  nu = z - h(x), s = H P H' + R, K = P H' / s                   H = dh/dx
                   x <- x + K nu              P <- P - K H P - P H' K' + K s K'  (Joseph form)
 
 h and H are evaluated once a step, at the predicted state, and the rows conditioned on one by one: the same
 answer as all at once, in O(m d^2) and without inverting a matrix.
+
+Noise comes in all through a step, and what moves a rate early moves its integral by the end: of white noise of variance
+q a second on a rate, the step leaves ``q dt`` there, ``q dt^2 / 2`` in common with the integral, and ``q dt^3 / 3`` in
+that.  With ``q dt`` alone the integral follows the start of a turn half a step late.
 
 What arrives is not trusted.  Missing values (NaN) are skipped; so are infinite ones, and counted.  What
 disagrees with the prediction beyond the gate of its sensor is left out, and believed once after a while, so
@@ -87,8 +91,8 @@ class FilterModel:
     #: zero.  Both are functions of numba, ``@njit``
     observe: Any
     params: Array  #: what the two functions need of the robot; the inputs of a sample stand behind them
-    #: variances in squared natural units, as ``0.02**2``: (d,) or (d, d) **per second**, a step of dt adds Q dt;
-    #: (m,) of each row, rows are independent; (d,) or (d, d) of the state where nothing is known
+    #: variances in squared natural units, as ``0.02**2``: (d,) or (d, d) **per second**, a step of dt adds
+    #: :func:`process_noise`; (m,) of each row, rows are independent; (d,) or (d, d) of the state where nothing is known
     process_variance: Array
     measurement_variance: Array
     initial_variance: Array
@@ -100,6 +104,8 @@ class FilterModel:
     held: tuple[str, ...] = ()
     #: states that a gap in the data leaves where they were, with a covariance that grew
     positions: tuple[str, ...] = ()
+    #: states that integrate another one, each with it: they share its noise
+    integrals: tuple[tuple[str, str], ...] = ()
     angle_states: tuple[str, ...] = ()  #: states that are wrapped to (-pi, pi], and rows whose innovation is
     angle_rows: tuple[str, ...] = ()
 
@@ -118,10 +124,10 @@ class FilterModel:
             raise ConfigError(f"{place}: its sensors must hold every row once; they hold {grouped}")
         for what, known in (
             *dict.fromkeys(("references", "held"), self.sensor_names).items(),
-            *dict.fromkeys(("positions", "angle_states"), self.states).items(),
+            *dict.fromkeys(("positions", "integrals", "angle_states"), self.states).items(),
             ("angle_rows", self.rows),
         ):
-            if unknown := set(getattr(self, what)) - set(known):
+            if unknown := set(np.ravel(getattr(self, what)).tolist()) - set(known):
                 raise ConfigError(f"{place}: {what} name {unknown}, none of {', '.join(known)}")
         if not len(self.initial_mean):
             object.__setattr__(self, "initial_mean", np.zeros(d))
@@ -188,6 +194,7 @@ MODEL = record(
         **dict.fromkeys(
             ("is_reference", "is_held", "is_angle_row", "is_angle_state", "is_position"), (bool, MOST)
         ),
+        "rate": (int, MOST),  # of a state that integrates it; -1 of others
         "x0": (float, MOST),
         **dict.fromkeys(("p0", "q"), (float, (MOST, MOST))),
         "thresholds": (float, MOST + 1),
@@ -283,10 +290,24 @@ def _reset_covariance(model: Any, state: Any, chosen: Array) -> None:
 
 
 @_inner
+def _noise(model: Any, walk: Array, i: int, k: int, dt: float) -> float:
+    """Return an entry of :func:`process_noise`."""
+    per_i, per_k = model.rate[i], model.rate[k]
+    noise = model.q[i, k] + (walk[i] if i == k else 0.0)
+    if per_i >= 0:
+        noise += dt / 2.0 * (model.q[per_i, k] + (walk[k] if per_i == k else 0.0))
+    if per_k >= 0:
+        noise += dt / 2.0 * (model.q[i, per_k] + (walk[i] if per_k == i else 0.0))
+    if per_i >= 0 and per_k >= 0:
+        noise += dt * dt / 3.0 * (model.q[per_i, per_k] + (walk[per_i] if i == k else 0.0))
+    return float(noise * dt)
+
+
+@_inner
 def _predict(
     model: Any, state: Any, work: Any, is_gap: bool, dt: float, walk: Array, params: Array, propagate: Any
 ) -> None:
-    """Predict x <- f(x, dt), and P <- F P F' + Q dt, symmetric to the last bit.
+    """Predict x <- f(x, dt), and P <- F P F' + :func:`process_noise`, symmetric to the last bit.
 
     Where that leads out of this world, begin anew but for positions that do not.  Over a gap all covariances are
     reset but those of the positions, which grow by what the speeds may have been, and the means stay.
@@ -308,13 +329,12 @@ def _predict(
     n_bad = 0
     for i in range(d):
         for k in range(i + 1):
-            total = model.q[i, k] * span_s
+            total = _noise(model, walk, i, k, span_s)
             for j in range(d):
                 if f[k, j] != 0.0:
                     total += fp[i, j] * f[k, j]
             p_next[i, k] = total
             p_next[k, i] = total
-        p_next[i, i] += walk[i] * span_s
         n_bad += not ((abs(work.x_next[i]) <= LARGEST) & (p_next[i, i] > 0.0) & (p_next[i, i] <= WIDEST))
     if is_gap:
         for i in range(d):
@@ -337,6 +357,16 @@ def _predict(
             state.rejected_s[k] = -1.0
         elif state.rejected_s[k] >= 0.0:
             state.rejected_s[k] += dt
+
+
+def process_noise(model: FilterModel, dt_s: float, walk: Array | float = 0.0) -> Array:
+    """Return the covariance (d, d) that a step adds, with what the states walk (d,) beside, in variance per second."""
+    d = len(model.states)
+    per_s = model.process_variance + np.diag(np.broadcast_to(walk, d))
+    moved = np.zeros((d, d))  # by what a rate was moved by within the step
+    for state, rate in model.integrals:
+        moved[model.states.index(state), model.states.index(rate)] = dt_s
+    return np.asarray(per_s + (moved @ per_s + per_s @ moved.T) / 2.0 + moved @ per_s @ moved.T / 3.0) * dt_s
 
 
 @_inner
@@ -602,6 +632,9 @@ class Filter:
             ("is_position", model.states, model.positions),
         ):
             one[name][: len(names)] = np.isin(names, chosen)
+        one["rate"] = -1
+        for name, rate in model.integrals:
+            one["rate"][model.states.index(name)] = model.states.index(rate)
         one["x0"][:d] = model.initial_mean
         one["p0"][:d, :d], one["q"][:d, :d] = model.initial_variance, model.process_variance
         dof = np.arange(1.0, 1 + max(n_rows))

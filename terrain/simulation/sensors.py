@@ -266,8 +266,7 @@ def steering_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> S
     return Sensor(motion, robot.steer_channels, stamps, write)
 
 
-# Bandwidths of the BNO055 in its fusion modes (Bosch data sheet), and noise of its fused roll and pitch; assumed.
-IMU_BANDWIDTH_HZ, TILT_NOISE_RAD = {"accel": 62.5, "gyro": 47.0}, 0.001
+TILT_NOISE_RAD = 0.001  # noise of an IMU's fused roll and pitch; assumed
 
 
 def described_imu(sensors: Sensors) -> tuple[Array, Array]:
@@ -326,7 +325,7 @@ def imu_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> tuple[
     scale, bias, noise = draw_imu_errors(
         sensors, len(stamps[0]), rng, robot.effects.get("gyro_scale_ratio", 0.0)
     )
-    lags_s = [1 / (2 * math.pi * IMU_BANDWIDTH_HZ[name]) for name in ("gyro", "accel") for _ in range(3)]
+    lags_s = np.repeat(sensors.imu_time_constants_s, 3).tolist()
 
     def fill(first: int, out: Array) -> None:
         _rates_and_force(record, motion.up, first, height_m, out)

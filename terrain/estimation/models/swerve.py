@@ -107,6 +107,9 @@ _STATES: dict[str, tuple[float, float]] = {
     "imu_yaw_offset_rad": (0.01, 3.5e-4),
     **dict.fromkeys(("accel_bias_x_mps2", "accel_bias_y_mps2"), (0.05, 2e-3)),
 }
+_INTEGRALS = (
+    *(("yaw_rad", "yaw_rate_radps"), ("speed_x_mps", "accel_x_mps2"), ("speed_y_mps", "accel_y_mps2")),
+)
 _N_SHARED, _POSITION, _SITE_STD_M = 12, ("position_x_m", "position_y_m"), 100.0
 _X, _Y, _YAW, _VX, _VY, _W, _AX, _AY = range(8)  # places in the state
 _STEER, _BIAS, _SLIP, _OFFSET, _ACCEL_BIAS = 8, 11, 12, 15, 16
@@ -117,7 +120,7 @@ _STEER, _BIAS, _SLIP, _OFFSET, _ACCEL_BIAS = 8, 11, 12, 15, 16
 # a low-pass colours the noise of every sensor.
 _SENSORS: dict[str, tuple[tuple[str, ...], float | tuple[float, ...]]] = {
     "camera_yaw_rate": (CAMERA_ROWS[2:3], 0.0012),
-    "camera_yaw": (CAMERA_ROWS[3:], 0.005),
+    "camera_yaw": (CAMERA_ROWS[3:], 0.0005),
     "gyro": (("gyro_z_radps",), 0.0012),
     "imu_yaw": (("imu_yaw_rad",), 0.05),
     "camera_speed": (CAMERA_ROWS[:2], 0.0006),
@@ -259,9 +262,7 @@ def make_filter(name: str, robot: Robot, with_gnss: bool = False, thesis: bool =
 
     Physical noise is how fast a robot changes and what its sensors scatter by.  A sensor scatters by what vibration
     and delays do to it on any robot, or by what the description says of it, whichever is more; of n samples a tick, by
-    1 / sqrt(n) of that.  An acceleration that walks by q a second moves the speed within a tick T, too: beside
-    ``q T`` of its own it leaves ``q T^2 / 2`` in common with the speed, and ``q T^3 / 3`` there.  Without these the
-    speed would follow a start half a tick late.
+    1 / sqrt(n) of that.
 
     Parameters
     ----------
@@ -297,7 +298,7 @@ def make_filter(name: str, robot: Robot, with_gnss: bool = False, thesis: bool =
     initial_std, walk_std = np.array(list(_STATES.values()))[: len(states)].T
     if with_gnss:
         initial_std[:2] = _SITE_STD_M
-    process, initial, least = np.diag(walk_std**2), initial_std**2, dict[str, float]()
+    process, initial, least = walk_std**2, initial_std**2, dict[str, float]()
     if robot.describes("sensors"):
         described = robot.sensors
         wheels_hz = described.wheels_rate_hz
@@ -313,10 +314,6 @@ def make_filter(name: str, robot: Robot, with_gnss: bool = False, thesis: bool =
                 camera.yaw_std_rad * seen,
             )
             least["camera_yaw_rate"] = camera.yaw_rate_std_radps * seen
-        for speed, accel in ((_VX, _AX), (_VY, _AY)):
-            walk, tick_s = process[accel, accel], 1.0 / wheels_hz
-            process[speed, accel] = process[accel, speed] = walk * tick_s / 2.0
-            process[speed, speed] += walk * tick_s**2 / 3.0
     sensors, variance = dict[str, tuple[str, ...]](), np.empty(len(rows))
     for sensor, (group, scatter) in _SENSORS.items():
         if group[0] in rows:
@@ -326,8 +323,7 @@ def make_filter(name: str, robot: Robot, with_gnss: bool = False, thesis: bool =
             variance[list(map(rows.index, group))] = np.maximum(std, least.get(sensor, 0.0)) ** 2
     if thesis:
         r, q, p0 = _THESIS[has_camera]
-        process = np.diag(walk_std**2)
-        process[range(len(q)), range(len(q))] = np.array(q) / THESIS_SAMPLE_TIME_S
+        process[: len(q)] = np.array(q) / THESIS_SAMPLE_TIME_S
         variance[: len(r)], initial[: len(p0)] = r, p0
     return FilterModel(
         name=f"{name} with GNSS" if with_gnss else name,
@@ -353,6 +349,7 @@ def make_filter(name: str, robot: Robot, with_gnss: bool = False, thesis: bool =
         references=(*("camera_speed",) * has_camera, *("gnss_speed",) * with_gnss),
         held=_HELD if has_slip else (),
         positions=_POSITION,
+        integrals=() if thesis else _INTEGRALS,
         angle_states=("yaw_rad", *_STEER_ROWS),
         angle_rows=("imu_yaw_rad", *_STEER_ROWS, *CAMERA_ROWS[3:] * has_camera),
     )

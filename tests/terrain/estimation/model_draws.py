@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from terrain.angles import wrapped
-from terrain.estimation.filter import FilterModel
+from terrain.estimation.filter import FilterModel, process_noise
 from terrain.kernels import njit
 
 
@@ -13,7 +13,7 @@ def sample_from_model(model, n, dt_s, rng):
     """Return ``time_s (n,), truth (n, d), z (n, m)``; the truth starts from the initial mean and variance."""
     d, m = len(model.states), len(model.rows)
     x = model.initial_mean + np.linalg.cholesky(model.initial_variance) @ rng.standard_normal(d)
-    values, vectors = np.linalg.eigh(model.process_variance * dt_s)
+    values, vectors = np.linalg.eigh(process_noise(model, dt_s))
     walk = rng.standard_normal((n, d)) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
     z = rng.standard_normal((n, m)) * np.sqrt(model.measurement_variance)
     is_angle_state, is_angle_row = (

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from model_draws import CARRIAGE, carriage, drift, sample_from_model
 
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.filter import Filter, FilterModel, FilterSettings, run_filter
+from terrain.estimation.filter import Filter, FilterModel, FilterSettings, process_noise, run_filter
 from terrain.kernels import njit
 from terrain.records import ABSENT, GATED, REOPENED, USED
 
@@ -67,6 +67,7 @@ FLIGHT = FilterModel(
     initial_mean=np.array([0.0, 0.0, 0.0, 1.0, 0.0]),
     references=("fix",),
     positions=("position_x_m", "position_y_m"),
+    integrals=(("yaw_rad", "yaw_rate_radps"),),
     angle_states=("yaw_rad",),
     angle_rows=("bearing_rad",),
 )
@@ -87,7 +88,7 @@ def dense_filter(model, time_s, z, wrapped=()):
             dt = now - time_s[n - 1]
             x_next, f = np.zeros(d), np.zeros((d, d))
             model.propagate(x, dt, params, x_next, f)
-            x, p = x_next, f @ p @ f.T + model.process_variance * dt
+            x, p = x_next, f @ p @ f.T + process_noise(model, dt)
         z_hat, h = np.zeros(m), np.zeros((m, d))
         model.observe(x, params, z_hat, h)
         rows = np.flatnonzero(np.isfinite(z[n]))
@@ -98,6 +99,8 @@ def dense_filter(model, time_s, z, wrapped=()):
         s = h @ p @ h.T + r
         k = np.linalg.solve(s, h @ p).T
         x = x + k @ nu
+        turns = np.isin(model.states, model.angle_states)
+        x[turns] = np.angle(np.exp(1j * x[turns]))
         left = np.eye(d) - k @ h
         p = left @ p @ left.T + k @ r @ k.T
         nis = nu @ np.linalg.solve(s, nu)
@@ -121,6 +124,22 @@ def test_rows_one_by_one_equal_the_textbook_all_at_once(flown, share_missing):
     assert (track.cov == track.cov.transpose(0, 2, 1)).all()
     np.testing.assert_array_equal(track.nis_dof.sum(axis=1), np.isfinite(z).sum(axis=1))
     np.testing.assert_array_equal(track.use == ABSENT, track.nis_dof == 0)
+
+
+@pytest.mark.parametrize("dt_s", [0.02, 0.5])
+def test_noise_of_a_step_is_that_of_many_small_ones(dt_s):
+    """Of states that integrate a rate which walks, also by more than the model's own; the filter adds the same."""
+    walk, moved, exact, n = np.array([0.0, 0.0, 1e-5, 0.02, 0.3]), np.eye(5), np.zeros((5, 5)), 4000
+    moved[2, 4] = dt_s / n
+    for _ in range(n):
+        exact = moved @ exact @ moved.T + (WALK + np.diag(walk)) * (dt_s / n)
+    noise = process_noise(FLIGHT, dt_s, walk)
+    np.testing.assert_allclose(noise, exact, rtol=1e-3)
+    assert noise[2, 4] == pytest.approx((0.1**2 + 0.3) * dt_s**2 / 2)
+    flight, f = Filter(FLIGHT), np.zeros((5, 5))
+    flight.run(np.array([0.0, dt_s]), np.full((2, 5), np.nan), walk=walk)
+    FLIGHT.propagate(FLIGHT.initial_mean.copy(), dt_s, FLIGHT.params.copy(), np.zeros(5), f)
+    np.testing.assert_allclose(flight.cov, f @ FLIGHT.initial_variance @ f.T + noise, rtol=1e-12)
 
 
 def ridden(n=400, seed=0):

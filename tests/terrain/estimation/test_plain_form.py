@@ -25,6 +25,8 @@ ODD = ROBOT.with_parts(
         accel_bias_x_mps2=0.1,
         accel_scale_y_ratio=0.97,
         imu_latency_s=0.02,
+        gyro_bandwidth_hz=8.0,
+        accel_bandwidth_hz=2.0,
     ),
     steering=replace(ROBOT.steering, zero_1_rad=3.0, zero_2_rad=-2.0, zero_3_rad=0.5),
     camera=replace(ROBOT.camera, time_constant_s=0.02, lever_x_m=0.1, latency_s=0.03),
@@ -257,6 +259,8 @@ def plain_table(run, robot, causal, initial_yaw_rad):
     once, twice, moving = plain_moving(clock, rates * robot.wheel_radius_m)
     table, jumps = dict(zip(rows, rates.T, strict=False)), {}
     imu_s, accel_z = np.zeros(0), np.zeros(0)
+    gyro_s, accel_s = (max(lag_s - own_s, 0.0) for own_s in robot.sensors.imu_time_constants_s)
+    low_pass_s = {"gyro_z_radps": gyro_s, "accel_x_mps2": accel_s, "accel_y_mps2": accel_s}
     camera_lag_s = max(lag_s - robot.camera.time_constant_s, 0.0)
     gnss_variance = dict.fromkeys(feed.GNSS_ROWS, np.full(clock.size, np.nan))
     for name, latency_s, tau_s in (
@@ -300,7 +304,7 @@ def plain_table(run, robot, causal, initial_yaw_rad):
         jumps[name] = int(np.any(list(found.values()), axis=0).sum())
         for row, signal in signals.items():
             signal = np.where(found[row], np.nan, signal)
-            table[row] = plain_on_clock(clock, time_s, came_s, signal, tau_s)
+            table[row] = plain_on_clock(clock, time_s, came_s, signal, low_pass_s.get(row, tau_s))
     table = {row: table.get(row, np.full(clock.size, np.nan)) for row in rows}
     derived, square = plain_derived(clock, table, once, twice, imu_s, accel_z, robot)
     came_s = imu_s + (robot.sensors.imu_latency_s if causal else 0.0)

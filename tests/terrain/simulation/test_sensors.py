@@ -14,7 +14,6 @@ from terrain.simulation.plants.dynamic import dynamic_truth
 from terrain.simulation.scenario import NO_FAULTS, Faults
 from terrain.simulation.sensors import (
     BODY_ROW,
-    IMU_BANDWIDTH_HZ,
     STEP_S,
     TILT_NOISE_RAD,
     Gnss,
@@ -221,7 +220,7 @@ def test_latency_and_lag_come_back_from_the_phase_of_a_sine():
         return latency_s + math.atan(turn * time_constant_s) / turn
 
     gyro_s, accel_s = (
-        lag_s(1 / (2 * math.pi * IMU_BANDWIDTH_HZ[name]), sensors.imu_latency_s) for name in ("gyro", "accel")
+        lag_s(time_constant_s, sensors.imu_latency_s) for time_constant_s in sensors.imu_time_constants_s
     )
     speed_s = lag_s(camera.time_constant_s, camera.latency_s)
     imu, _ = imu_stream(motion, ROBOT, rng())
