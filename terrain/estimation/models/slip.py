@@ -6,8 +6,8 @@ root mean square U of all of them, is
 
 .. math:: D_i V = u_i (1 - m_i) - \chi\, t_i - d_i U .
 
-- **m**, the slip of this ground, of each side of a robot that skids, else of all wheels: a random walk while the robot
-  moves, the same forward and backward, and through standstill.
+- **m**, the slip of this ground, of each side of a robot that skids and each wheel that rolls across, else of all
+  wheels: a random walk while the robot moves, the same forward and backward, and through standstill.
 - **chi**, what is lost in turning.  Robots that skid: :math:`t = \mp (u_r - u_l) / 2` left and right, so that straight
   motion does not show it and the effective track is :math:`B / (1 - \chi)` (Mandow et al., Experimental kinematics for
   wheeled skid-steer mobile robots, IROS 2007).  Robots that steer: a row across the front wheel, which does not slide,
@@ -24,6 +24,10 @@ walks; sideways speed of robots that cannot drive sideways returns to 0.  A gyro
 
 **Ages.**  A fix is of an instant before its tick.  It is not moved to it: what the filter expects of it is that of its
 own instant, by its state, so that a receiver that is late leaves no error in the speed to first order.
+
+**Scatter of poses.**  Nothing states it, and it differs by a hundred between systems: it is that of third differences
+of four poses that follow each other evenly, over the root of 20, their gain on white noise; motion adds its jerk times
+the cube of the period.
 
 **Heading.**  Without pose or compass the heading follows from the motion.  Until it is known the filter runs in a frame
 that begins at 0; the angle between the travel by wheels and gyro and that of the receiver, and its deviation, then turn
@@ -68,8 +72,9 @@ FAST_RATIO, FAST_PER_MPS2, FAST_TURNING = 0.01, 0.12, 0.06
 weight in traction, adds; and what turning on the spot does."""
 SLOW_RATIO, SLOW_WALK = 0.2, 0.012
 """Of m at first, about 0, and its walk within a second of driving."""
-TURN_WALK = 0.02
-"""Walk of chi within a second of turning."""
+TURN_WALK, DIRECTION_RATIO = 0.02, 0.15
+"""Walk of chi within a second of turning, and of m of a robot that drives in any direction where that changes by a
+radian: its wheels pull in another one."""
 ACROSS_RATIO, ACROSS_M = 0.01, 0.05
 """Sideways speed over the speed of the wheels, and over the yaw rate: of a robot that skids, and in turns."""
 WHEEL_STD_MPS, GYRO_STD_RADPS, YAW_ACCEL = 0.01, 0.005, 1.0
@@ -80,7 +85,9 @@ ACCEL_WALK, SHAKEN_RATIO, FREE_WALK = 0.05, 0.1, 1.0
 TILTED_STD, TILTED_WALK, UNTILTED_STD, UNTILTED_WALK = 0.15, 0.02, 0.6, 0.3
 """Of the accelerometer's bias with a measured pitch, and without one, where it is the slope's gravity."""
 POSE_STD_M, POSE_STD_RAD, COMPASS_STD_RAD, CAMERA_STD_MPS, GNSS_SPEED_STD_MPS = 0.02, 0.02, 0.05, 0.03, 0.03
-"""Of measurements whose own deviation is not given."""
+"""Of measurements whose own deviation is not given; of poses at first."""
+LEAST_POSE_STD_M, LEAST_POSE_STD_RAD, N_POSES, POSES_FORGOTTEN = 5e-4, 5e-4, 20, 100
+"""Of the scatter of poses: the least, what the first value counts as, and how many poses are remembered."""
 DELAY_S, DELAY_STD_S = 0.05, 0.05
 """Of fixes behind their stamps, at first: some are stamped when they are measured, some when they arrive."""
 ALIGNED_RAD, CRAB_RAD, LOST_RAD = 0.05, 0.05, 0.6
@@ -246,7 +253,7 @@ def rows_of_wheels(robot: Robot) -> WheelRows:
     logged = np.flatnonzero(np.isin(robot.wheels, robot.logged_wheels))
     across = np.flatnonzero(np.isin(robot.wheels, robot.steered_wheels))
     n = len(logged) + len(across)
-    return WheelRows(logged, across, tuple(range(n)) if robot.skids else (0,) * n)
+    return WheelRows(logged, across, tuple(range(n)) if robot.skids or robot.on_omni_wheels else (0,) * n)
 
 
 class SlipFilter(FilterObserver):
@@ -278,7 +285,7 @@ class SlipFilter(FilterObserver):
         logged, _, groups = self._wheels
         n_slow, n_rows, turns = 1 + max(groups), len(groups), robot.skids or isinstance(robot, BicycleRobot)
         names = [robot.wheels[i] for i in logged.tolist()]
-        slow = [f"ground_slip_{name}_ratio" for name in names] if robot.skids else ["ground_slip_ratio"]
+        slow = [f"ground_slip_{name}_ratio" for name in names] if n_slow > 1 else ["ground_slip_ratio"]
         self.states = (*_MOTION, *slow, *["turn_loss_ratio"] * turns)
         self.slips = tuple(f"slip_{name}_ratio" for name in names)
         self._speeds = tuple(f"speed_{name}_mps" for name in names)
@@ -336,8 +343,10 @@ class SlipFilter(FilterObserver):
         place = robot.wheel_positions_m, robot.wheel_directions_rad, robot.roller_angles_rad
         self._rolling, self._steer = rolling_matrix(*place)[logged], steer
         self._smooth_mps, self._accel_mps2, self._shaken_square = np.full(len(logged), np.nan), math.nan, 0.0
+        self._pulls = np.zeros(MOST_ROWS)
+        self._poses = np.zeros((0, 4))  # age in ticks' time, position and heading
+        self._pose_square, self._n_poses = np.square([POSE_STD_M, POSE_STD_RAD]), N_POSES
         self._is_placed, self._first, self._seen, self._weight = False, np.full(2, np.nan, complex), 0j, 0.0
-        self._known = np.full(len(logged), np.nan)
 
     def step(self, row: Array, dt_s: float) -> ObserverOutput:
         """Take a row of :attr:`rows`; the frame begins at the first pose, or where the heading becomes known."""
@@ -358,6 +367,7 @@ class SlipFilter(FilterObserver):
         gyro = given["yaw_rate_radps"]
         references = self._place(given, inputs)
         z = np.concatenate([z, [gyro if abs(gyro) <= MOST_RADPS else np.nan], references])
+        self._take_pose(given)
         variance = self._variance(given, rates_mps2, dt_s)
         fix = self.advance(dt_s, z, inputs, self._walk(given, inputs, rates_mps2, dt_s), variance, N_JUDGED)
         output = self._output(speeds, inputs, fix)
@@ -426,7 +436,8 @@ class SlipFilter(FilterObserver):
         fix_m = given["gnss_std_m"] if given["gnss_std_m"] > 0.0 else FLOAT_STD_M
         std[MOST_ROWS:] = (
             *(GYRO_STD_RADPS, fix_m, fix_m, *[math.hypot(GNSS_SPEED_STD_MPS, late_mps)] * 2),
-            *(POSE_STD_M, POSE_STD_M, POSE_STD_RAD, COMPASS_STD_RAD, CAMERA_STD_MPS, CAMERA_STD_MPS),
+            *np.sqrt(self._pose_square[[0, 0, 1]]),
+            *(COMPASS_STD_RAD, CAMERA_STD_MPS, CAMERA_STD_MPS),
         )
         return np.where(np.isfinite(std), std, GNSS_SPEED_STD_MPS) ** 2
 
@@ -445,11 +456,30 @@ class SlipFilter(FilterObserver):
         walk[_ACCEL_BIAS] = (TILTED_WALK if has_pitch else UNTILTED_WALK) ** 2
         tight = float(np.abs(inputs[_TURNING]).max()) / size if size > STANDING_MPS else 0.0
         if size > STANDING_MPS:
-            walk[_SLOW : _SLOW + n_slow] = SLOW_WALK**2
+            pulls = inputs[_SPEEDS] / (size * math.sqrt(n_rows))
+            turned = float(np.linalg.norm(pulls - self._pulls)) if self._robot.sideways else 0.0
+            walk[_SLOW : _SLOW + n_slow] = SLOW_WALK**2 + DIRECTION_RATIO**2 * turned / dt_s
+            self._pulls = pulls
             walk[_SLOW + n_slow : len(self.states)] = (TURN_WALK * tight) ** 2
         fast = FAST_RATIO + FAST_PER_MPS2 * float(np.abs(rates_mps2).max()) + FAST_TURNING * tight
         walk[-n_rows:] = _fading(fast**2, FAST_S, dt_s)
         return walk
+
+    def _take_pose(self, given: Mapping[str, float]) -> None:
+        """Learn how much poses scatter."""
+        x, y, yaw = (given[name] for name in _REFERENCES[4:7])
+        if not math.isfinite(x + y + yaw):
+            return
+        at_s = self._time_s - (given["pose_age_s"] if math.isfinite(given["pose_age_s"]) else 0.0)
+        self._poses = np.vstack([self._poses[-3:], [at_s, x, y, yaw]])
+        steps_s = np.diff(self._poses[:, 0])
+        if len(steps_s) == 3 and steps_s.min() > 0.8 * steps_s.max():
+            jumps = np.diff(np.column_stack([self._poses[:, 1:3], np.unwrap(self._poses[:, 3])]), 3, axis=0)[0]
+            squares = np.array([0.5 * float(jumps[:2] @ jumps[:2]), jumps[2] ** 2]) / 20.0
+            squares = np.minimum(squares, 9.0 * self._pose_square)  # a jump is no scatter
+            self._n_poses = min(self._n_poses + 1, POSES_FORGOTTEN)
+            learnt = self._pose_square + (squares - self._pose_square) / self._n_poses
+            self._pose_square = np.maximum(learnt, np.square([LEAST_POSE_STD_M, LEAST_POSE_STD_RAD]))
 
     def _place(self, given: Mapping[str, float], inputs: Array) -> Array:
         """Return the references that are used at a tick, and begin their frame where that becomes possible."""
