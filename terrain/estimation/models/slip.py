@@ -94,6 +94,9 @@ ALIGNED_RAD, CRAB_RAD, LOST_RAD = 0.05, 0.05, 0.6
 """Deviation at which a heading by the motion is used; that of the motion from the heading; and one that is lost."""
 LEAST_TRAVEL_M, LEAST_RATIO = 0.5, 0.3
 """Travel by the wheels that shows a heading, and how much of it the receiver has to see."""
+DELAY_BOUNDS_S, SLIP_BOUNDS, LOSS_BOUNDS, LARGEST_BIAS_MPS2 = (-0.2, 0.8), (-1.0, 1.0), (-0.3, 0.95), 3.0
+"""Bounds of delay, m and d, and chi, which move the mean; and a bias beyond which an accelerometer is left out: its
+units or axes are others."""
 OLDEST_S = 1.0
 """Age of a fix beyond which there is none."""
 LOST_S, LOST_RATIO = 2.0, 0.9
@@ -343,7 +346,9 @@ class SlipFilter(FilterObserver):
         place = robot.wheel_positions_m, robot.wheel_directions_rad, robot.roller_angles_rad
         self._rolling, self._steer = rolling_matrix(*place)[logged], steer
         self._smooth_mps, self._accel_mps2, self._shaken_square = np.full(len(logged), np.nan), math.nan, 0.0
-        self._pulls = np.zeros(MOST_ROWS)
+        self._pulls, self._accel_is_wrong = np.zeros(MOST_ROWS), False
+        bounds = [DELAY_BOUNDS_S, *[SLIP_BOUNDS] * n_slow, *[LOSS_BOUNDS] * turns, *[SLIP_BOUNDS] * n_rows]
+        self._bounds = np.array(bounds)
         self._poses = np.zeros((0, 4))  # age in ticks' time, position and heading
         self._pose_square, self._n_poses = np.square([POSE_STD_M, POSE_STD_RAD]), N_POSES
         self._is_placed, self._first, self._seen, self._weight = False, np.full(2, np.nan, complex), 0j, 0.0
@@ -370,6 +375,9 @@ class SlipFilter(FilterObserver):
         self._take_pose(given)
         variance = self._variance(given, rates_mps2, dt_s)
         fix = self.advance(dt_s, z, inputs, self._walk(given, inputs, rates_mps2, dt_s), variance, N_JUDGED)
+        mean = self.filter.mean
+        np.clip(mean[_DELAY:], self._bounds[:, 0], self._bounds[:, 1], out=mean[_DELAY:])
+        self._accel_is_wrong |= abs(float(mean[_ACCEL_BIAS])) > LARGEST_BIAS_MPS2
         output = self._output(speeds, inputs, fix)
         is_lost = self.filter.reference_age_s > LOST_S and (np.abs(output.slip) > LOST_RATIO).all()
         if is_lost:  # what it believes of the motion follows from nothing that is measured
@@ -410,7 +418,7 @@ class SlipFilter(FilterObserver):
         accel = given["accel_x_mps2"]
         if math.isfinite(given["pitch_rad"]):  # the specific force at rest is -g sin(pitch)
             accel += GRAVITY_MPS2 * math.sin(given["pitch_rad"])
-        accel = accel if abs(accel) <= MOST_MPS2 else math.nan
+        accel = accel if abs(accel) <= MOST_MPS2 and not self._accel_is_wrong else math.nan
         if math.isfinite(accel):
             if math.isnan(self._accel_mps2):
                 self._accel_mps2 = accel
@@ -474,7 +482,9 @@ class SlipFilter(FilterObserver):
         self._poses = np.vstack([self._poses[-3:], [at_s, x, y, yaw]])
         steps_s = np.diff(self._poses[:, 0])
         if len(steps_s) == 3 and steps_s.min() > 0.8 * steps_s.max():
-            jumps = np.diff(np.column_stack([self._poses[:, 1:3], np.unwrap(self._poses[:, 3])]), 3, axis=0)[0]
+            jumps = np.diff(np.column_stack([self._poses[:, 1:3], np.unwrap(self._poses[:, 3])]), 3, axis=0)[
+                0
+            ]
             squares = np.array([0.5 * float(jumps[:2] @ jumps[:2]), jumps[2] ** 2]) / 20.0
             squares = np.minimum(squares, 9.0 * self._pose_square)  # a jump is no scatter
             self._n_poses = min(self._n_poses + 1, POSES_FORGOTTEN)
