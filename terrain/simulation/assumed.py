@@ -19,7 +19,7 @@ The described robots of the package (0.04 to 0.2 m, 12 to 90 kg) are within a fa
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import MISSING, replace
 from typing import Any
 
 import numpy as np
@@ -77,7 +77,8 @@ def with_assumed(robot: Robot) -> Robot:
             continue
         kind = KIND_OF_SECTION[name]
         keys = kind.__dataclass_fields__
-        values = dict.fromkeys(keys, 0.0) | _NUMBERS[name](robot)
+        defaults = {key: 0.0 if item.default is MISSING else item.default for key, item in keys.items()}
+        values = defaults | _NUMBERS[name](robot)
         part: Any = kind(**{key: values[key] for key in keys})
         assumed = robot.assumed | {f"{name}.{key}" for key in keys}
         robot = replace(robot, parts={**robot.parts, name: part}, assumed=assumed)
