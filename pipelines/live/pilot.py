@@ -12,12 +12,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from pipelines.live.chain import Chain, CommandStatus, Step
-from pipelines.live.classifying import PILOT_FILTER
 from pipelines.live.model import TerrainModel
 from terrain.control.live_state import LiveState
 from terrain.control.robot_control import (
@@ -34,7 +32,7 @@ from terrain.control.traction import TractionStatus
 from terrain.estimation.clocks import Clocks, finite_twist
 from terrain.estimation.feed import places_among
 from terrain.estimation.health import SENSORS, Health
-from terrain.estimation.live import CHANNELS, LiveEstimate, LiveFilter
+from terrain.estimation.live import CHANNELS, Estimator, LiveEstimate, live_estimator
 from terrain.extension import correct_live
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
 from terrain.records import Command, Sample
@@ -55,11 +53,6 @@ def pilot_channels(robot: Robot) -> Mapping[str, tuple[str, ...]]:
     currents = (f"current_{wheel}_a" for wheel in robot.logged_wheels)
     streams = {"wheels": (*robot.rate_channels, *currents), "imu": IMU_CHANNELS}
     return streams | {"odometry": ("speed_x_mps", "speed_y_mps"), "gnss": GNSS_CHANNELS}
-
-
-def pilot_estimator(robot: Robot, channels: Mapping[str, tuple[str, ...]], correction: Any) -> Any:
-    """Return what estimates the motion of a corrected robot."""
-    return LiveFilter(robot, PILOT_FILTER, correction=correction)
 
 
 class LivePilot(Chain):
@@ -93,7 +86,7 @@ class LivePilot(Chain):
 
     name = "pilot"
     estimate: LiveEstimate | None
-    _filter: Any
+    _filter: Estimator | None
     _clocks: Clocks
 
     def __init__(
@@ -114,7 +107,7 @@ class LivePilot(Chain):
         if driven.drive != "swerve":  # their estimator takes what there is
             taken = {stream: tuple(names) for stream, names in channels.items()}
         if settings.controller not in OPEN_LOOP:
-            self._filter = pilot_estimator(driven, taken, correction)
+            self._filter = live_estimator(driven, taken, correction)
         states = () if self._filter is None else self._filter.states
         self.control = RobotControl(driven, table, settings, states, taken)
         self._steering_zeros_rad = np.array(driven.steering_zeros_rad)

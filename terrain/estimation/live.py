@@ -163,6 +163,11 @@ class Live(ABC):
         """Health of each sensor at the last tick, by name; empty where none is judged."""
         return {}
 
+    def at(self, now_s: float) -> LiveEstimate | None:
+        """Return what is believed at a time: the last estimate; None before the first tick."""
+        latest: LiveEstimate | None = self.latest
+        return latest
+
     @property
     def dropped(self) -> dict[str, int]:
         """What was not taken so far, as counts by stream and kind, and by what the filter did not believe."""
