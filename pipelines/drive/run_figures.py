@@ -50,7 +50,7 @@ def drive_curves(run: RunLog, table: SlipTable) -> DriveCurves:
     """
     truth, control = run.streams["truth"], run.streams["control"]
     speed = np.hypot(truth.channel("speed_x_mps"), truth.channel("speed_y_mps"))
-    wheels = [name.split("_")[1] for name in truth.channels if name.startswith("wheel_")]
+    wheels = [name[6:-6] for name in truth.channels if name.startswith("wheel_")]
     true = np.clip(true_slip(truth, wheels), -1.0, 1.0)
     slips = low_pass(np.nan_to_num(true), float(np.median(np.diff(truth.time_s))), SMOOTH_S)
     slips[speed < PEAK_ABOVE_MPS] = np.nan

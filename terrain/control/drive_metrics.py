@@ -86,7 +86,7 @@ BELIEF = ("believed_ratio", "n_accepted", "n_below_threshold", "n_refused")
 
 
 class DriveHistory(NamedTuple):
-    """The truth of a drive, evenly spaced: rows (n,) or, of wheels, (n, wheels)."""
+    """The truth of a drive, evenly spaced: rows (n,) or, of driven wheels, (n, wheels)."""
 
     time_s: Array
     speed_mps: Array  #: magnitude of the velocity over ground
@@ -108,7 +108,7 @@ def drive_history(
 ) -> DriveHistory:
     """Return the history of a simulated run of a robot.
 
-    Factors are the true radius of each wheel over the nominal one (``Conditions``); without them, wheels of different
+    Factors are the true radius of each of the first wheels over the nominal one (``Conditions``); without them, wheels of different
     radii appear to gain energy from the ground.
     """
     truth, wheels, commands = run.streams["truth"], robot.wheels, run.streams.get("commands")
@@ -121,8 +121,12 @@ def drive_history(
             *("traction_{}_n", "side_{}_n", "sinkage_{}_m"),
         )
     )
-    ground, sideways = wheel_frame_velocities(twist, robot.wheel_positions_m, steer)
-    wheel_speed = rate * robot.wheel_radius_m * np.asarray(radius_factors)
+    rollers, driven = robot.roller_angles_rad, np.isin(wheels, robot.logged_wheels)
+    axis = steer + robot.wheel_directions_rad + rollers
+    ground, sideways = wheel_frame_velocities(twist, robot.wheel_positions_m, axis)
+    ground = ground / np.cos(rollers)
+    factors = np.array([*radius_factors, *np.ones(len(wheels))])[: len(wheels)]
+    wheel_speed = rate * robot.wheel_radius_m * factors
     along_w = (traction * (wheel_speed - ground)).sum(axis=1)
     velocity = twist[:, :2]
     progress = np.linalg.norm(velocity, axis=1)
@@ -134,7 +138,7 @@ def drive_history(
         at = last[np.clip(np.searchsorted(commands.time_s, time_s, side="right") - 1, 0, size.size - 1)]
         direction = desired[at] / np.maximum(size[at], 1e-9)[:, None]
         progress = np.where(at < 0, progress, np.einsum("ij,ij->i", velocity, direction))
-    true = true_slip(truth, wheels)
+    true = true_slip(truth, robot.logged_wheels)
     slip = low_pass(np.nan_to_num(true), step_s, SMOOTH_S)
     slip[np.isnan(true)] = np.nan
     return DriveHistory(
@@ -146,8 +150,8 @@ def drive_history(
         np.cumsum(np.maximum(torque * rate, 0.0).sum(axis=1)) * step_s,
         np.cumsum(along_w - (side * sideways).sum(axis=1)) * step_s,
         np.cumsum(along_w) * step_s,
-        wheel_speed,
-        ground,
+        wheel_speed[:, driven],
+        ground[:, driven],
         slip,
         sinkage.max(axis=1),
         truth.channel("yaw_rad"),

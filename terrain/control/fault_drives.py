@@ -159,7 +159,7 @@ def fault_drive(run: RunLog, history: DriveHistory, robot: Robot, scenario: Scen
     speed, true_slip, body_slip = (
         np.interp(time_s, history.time_s, each) for each in (history.speed_mps, slip, body)
     )
-    wheels = commands.columns(f"wheel_{i}_radps" for i in robot.wheels)
+    wheels = commands.columns(f"wheel_{i}_radps" for i in robot.logged_wheels)
     desired = np.hypot(scenario.twist[:, 0], scenario.twist[:, 1])
     return FaultDrive(
         time_s,
