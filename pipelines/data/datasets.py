@@ -14,11 +14,11 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipelines.data.settings import AlignedRunsSettings, RunsSettings, chosen_runs
-from terrain.errors import ConfigError, DoubtfulRunWarning, LogError
+from terrain.errors import ConfigError, DoubtfulRunWarning, LogError, TerrainError
+from terrain.logs.motion_checks import Described
 from terrain.logs.plausibility import (
     Check,
     Doubt,
-    Scale,
     counted,
     doubt_sentences,
     doubts_of,
@@ -29,7 +29,7 @@ from terrain.logs.plausibility import (
 if TYPE_CHECKING:
     from pipelines.data.runs import Runs
     from terrain.logs.drive import DriveRobot
-    from terrain.records import RunLog
+    from terrain.records import RunLog, Stream
     from terrain.robots import Robot
 
     Readers = list[Callable[..., RunLog]]
@@ -249,7 +249,56 @@ def verdict(run: RunLog, robot: Robot | None = None) -> tuple[Check, ...]:
     except ConfigError:
         return judge(run)
     fastest_mps = getattr(known, "speed_max_mps", _wheel_rate_max_radps(known) * known.wheel_radius_m)
-    return judge(run, Scale(known.track_m, fastest_mps))
+    motors = known.motors if known.describes("motors") else None
+    twist, contradiction = _motion_of_wheels(run, known)
+    described = Described(
+        track_m=known.track_m,
+        speed_max_mps=fastest_mps,
+        twist=twist,
+        contradiction=contradiction,
+        sideways=known.sideways,
+        length_m=max(known.track_m, known.wheelbase_m),
+        front_driven=getattr(known, "front_driven", False),
+        wheel_radius_m=known.wheel_radius_m,
+        reduction_ratio=math.nan if motors is None else motors.reduction_ratio,
+        steering_rate_max_radps=known.steering_rate_max_radps,
+        current_max_a=math.inf if motors is None else motors.torque_max_nm / motors.nm_per_a,
+    )
+    return judge(run, described)
+
+
+def _motion_of_wheels(run: RunLog, robot: Robot) -> tuple[Stream | None, tuple[float, float]]:
+    """Return the body's twist by the wheels of a run as if they rolled, and how they contradict each other.
+
+    The twist is None where some wheels are not logged.  The part of the speeds that no twist explains is that with
+    steering angles as logged and with turned ones, NaN of what is not steered at each wheel.
+    """
+    import numpy as np
+
+    from terrain.kinematics.logged_wheels import with_wheel_speeds
+    from terrain.kinematics.wheels import no_slip_twist, rolled_twist
+    from terrain.logs.schema import TWIST
+    from terrain.records import Stream
+
+    try:
+        wheels = with_wheel_speeds(run, robot).streams["wheels"]
+        speeds = wheels.columns(f"speed_{wheel}_mps" for wheel in robot.logged_wheels)
+        angles = np.zeros((len(wheels), len(robot.wheels)))
+        if robot.steered:
+            steering = run.streams["steering"]
+            for i, channel in enumerate(robot.steer_channels):
+                angles[:, i] = np.interp(wheels.time_s, steering.time_s, steering.channel(channel))
+            angles -= robot.steering_zeros_rad
+        twist = Stream(wheels.time_s, rolled_twist(robot, speeds, angles), TWIST)
+        parts = [math.nan, math.nan]
+        if robot.steered and robot.sideways:
+            power = float(np.nansum(speeds**2)) or math.nan
+            for i, sign in enumerate((1.0, -1.0)):
+                _, rest = no_slip_twist(robot.wheel_positions_m, sign * angles, speeds)
+                parts[i] = math.sqrt(float(np.nansum(rest**2)) / power)
+        return twist, (parts[0], parts[1])
+    except (KeyError, TerrainError):
+        return None, (math.nan, math.nan)
 
 
 def _wheel_rate_max_radps(robot: Robot) -> float:

@@ -31,6 +31,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError, LogError
 from terrain.logs.clock import MIN_SAMPLES as MIN_YAW_RATES
 from terrain.logs.clock import yaw_rate_pair
+from terrain.logs.motion_checks import Described, motion_findings
 from terrain.logs.samples import BEYOND, MAX_MAGNITUDE
 from terrain.logs.schema import NO_FEATURES, signal_set_of, unit_of
 from terrain.records import Array, RunLog, Stream
@@ -160,14 +161,7 @@ def _unknown(check: str, place: str, why: str, measured: float = math.nan) -> Ch
     return Check(check, UNKNOWN, place, measured, why)
 
 
-class Scale(NamedTuple):
-    """What is known of the robot: nominal track, NaN where unknown, and top speed, infinite where unknown."""
-
-    track_m: float = math.nan
-    speed_max_mps: float = math.inf
-
-
-UNKNOWN_ROBOT = Scale()
+UNKNOWN_ROBOT = Described()
 
 MIN_SAMPLES = 5  #: Fewer show no rate.
 Case = tuple[bool | np.bool_, Level, str]  #: Whether it holds, how plausible a run is then, and why.
@@ -179,7 +173,7 @@ def _first(check: str, place: str, measured: float, *cases: Case) -> Check:
     return Check(check, level, place, measured, sentence)
 
 
-def judge(run: RunLog, scale: Scale = UNKNOWN_ROBOT) -> tuple[Check, ...]:
+def judge(run: RunLog, robot: Described = UNKNOWN_ROBOT) -> tuple[Check, ...]:
     """Return the verdict on a run in each respect; several of one where several apply.
 
     Examples
@@ -196,10 +190,12 @@ def judge(run: RunLog, scale: Scale = UNKNOWN_ROBOT) -> tuple[Check, ...]:
         for name, s in run.streams.items()
     }
     known = replace(run, streams=streams)
-    checks = [_gravity(known), _turns(known, scale), _speeds(known, scale)]
+    checks = [_gravity(known), _turns(known, robot), _speeds(known, robot)]
     for name, stream in run.streams.items():
         checks += [_sampling(name, stream), *check_names(name, stream)]
-    return (*checks, *_values(run), *_constants(known), _overlap(run))
+    levels = (OK, DOUBTFUL, IMPLAUSIBLE)
+    motion = [Check(each.check, levels[each.level], *each[2:]) for each in motion_findings(known, robot)]
+    return (*checks, *motion, *_values(run), *_constants(known), _overlap(run))
 
 
 # -- Gravity: what an accelerometer measures on Earth ---------------------------------------------------------
@@ -269,11 +265,11 @@ TURN_RATIO = (0.1, 1.5)
 MAX_IMPLAUSIBLE_TURN_RATIO = 8.0
 
 
-def _turns(run: RunLog, scale: Scale) -> Check:
+def _turns(run: RunLog, robot: Described) -> Check:
     """Return how the gyro's yaw rate agrees with the turn of a left and a right wheel."""
-    about, described = ("yaw rate", "gyro_z_radps"), math.isfinite(scale.track_m)
+    about, described = ("yaw rate", "gyro_z_radps"), math.isfinite(robot.track_m)
     try:
-        pair = yaw_rate_pair(run, scale.track_m if described else 1.0)
+        pair = yaw_rate_pair(run, robot.track_m if described else 1.0)
     except DataError:
         return _unknown(*about, "yaw rate: no gyro about z, or no left and right wheel speed")
     if pair is None:
@@ -318,7 +314,7 @@ MAX_OVERSPEED = (1.5, 5.0)
 SPEED_QUANTILE = 0.99
 
 
-def _speeds(run: RunLog, scale: Scale) -> Check:
+def _speeds(run: RunLog, robot: Described) -> Check:
     about, stream, speeds = ("wheel speed", "wheels"), run.streams.get("wheels"), np.empty(0)
     if stream is not None:
         speeds = stream.values[:, [name.startswith("speed_") for name in stream.channels]]
@@ -328,9 +324,9 @@ def _speeds(run: RunLog, scale: Scale) -> Check:
     fast = float(np.quantile(speeds, SPEED_QUANTILE))
     low, high = MAX_SPEED_MPS
     expected = f"up to {low:g} m/s is expected"
-    if math.isfinite(scale.speed_max_mps):
-        low, high = (factor * scale.speed_max_mps for factor in MAX_OVERSPEED)
-        expected = f"the robot's top speed is {scale.speed_max_mps:.3g} m/s"
+    if math.isfinite(robot.speed_max_mps):
+        low, high = (factor * robot.speed_max_mps for factor in MAX_OVERSPEED)
+        expected = f"the robot's top speed is {robot.speed_max_mps:.3g} m/s"
     measured = f"wheel speed: {fast:.3g} m/s ({SPEED_QUANTILE:.0%} of the samples are slower)"
     odd = f"{measured}, {expected}: rad/s or km/h read as m/s?"
     odd_cases: list[Case] = [(fast > max(low, high), IMPLAUSIBLE, odd), (fast > low, DOUBTFUL, odd)]

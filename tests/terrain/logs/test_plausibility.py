@@ -8,13 +8,14 @@ import pytest
 from pipelines.data.datasets import verdict
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
-from terrain.logs.plausibility import Level, Scale, doubt_sentences, doubts_of, judge, stream_quality, worst
+from terrain.logs.motion_checks import Described
+from terrain.logs.plausibility import Level, doubt_sentences, doubts_of, judge, stream_quality, worst
 from terrain.logs.run_folders import write_run
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 
-HUSKY = Scale(0.5708, 1.0065)
+HUSKY = Described(0.5708, 1.0065)
 DEGREE = np.pi / 180.0
 
 

@@ -1,0 +1,589 @@
+"""Whether the sensors of a run that see its motion agree: in unit, sign, axes and scale.
+
+Speeds and turns of a robot are seen by several sensors: wheels, gyro, a lidar or camera, poses, satellites, a compass.
+Each becomes the mean of a second on one grid: the change of an angle or a position over that second, or of the integral
+of a rate or a speed, so that sensors of any rate compare.  Two clocks may be apart (:data:`SHIFTS_S`).
+
+**Turns.**  A course that is measured turns as the body does; with the velocity v of the ground and the yaw rate w of
+the body, ``v x dv/dt = w |v|^2`` where the robot drives along one axis, forward or back, whatever the frame's
+direction; x and y exchanged turn the sign.  No yaw angle is needed.
+
+**Who is wrong.**  Of three sensors the one is named that two others contradict; of two the second.
+
+What certainly is a mistake is a turned sign of what otherwise agrees, or a factor beyond :data:`IMPLAUSIBLE_RATIO`,
+which degrees (57.3), km/h (3.6) and mm (1000) are; knots (1.94) and slip are within, and doubtful.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.logs.schema import TWIST
+from terrain.records import Array, RunLog, Stream
+from terrain.signals import agreement
+
+STEP_S = 0.2
+MEAN_S = 1.0  #: Changes of positions and angles are over this: noise of a receiver of 2 cm is then 3 cm/s
+MIN_POINTS = 15
+SHIFTS_S = np.linspace(-1.4, 1.4, 15)
+MIN_SPEED_MPS = 0.1  #: Root mean square below which noise is as large as the motion
+MIN_TURN_RADPS = 0.1
+#: Cosine of the angle between two signals, from which their ratio and its sign mean something; of speeds, which are all
+#: positive, the correlation.
+MIN_LIKENESS = 0.8
+MAX_OTHER_LIKENESS = 0.3  #: A regular to and fro is like both signs at some shift: then none is certain
+DOUBTFUL_RATIO = 1.5
+DOUBTFUL_TURN_RATIO = 2.0  #: Scans that were matched in turns are off by more than positions.
+IMPLAUSIBLE_RATIO = 3.0
+#: Ground speed over that of wheels: they slip by any part, so that less than so much is doubtful.
+LEAST_OF_WHEELS = 0.3
+IMPLAUSIBLE_OF_WHEELS = 1.0 / 30.0
+#: Part of the power of the velocity along the body's x axis, of a robot that cannot drive sideways.
+MIN_AHEAD = (0.5, 0.1)
+STILL_M = 5e-4  #: No receiver's positions stay within this for seconds.
+STEERING_RATE_RADPS = 20.0  #: No steering is faster.
+MAX_STD_OF_FIX_M = 1.0
+#: Part of the speeds of steered wheels that no twist explains, from which, and over that of turned angles beyond which,
+#: the sign of the steering is turned: sound wheels that slip contradict each other by 0.02.
+CONTRADICTION, OVER_TURNED = 0.05, 3.0
+MIN_TILT_RAD = 0.02  #: Less is that of a floor, and of offsets.
+MIN_CERTAIN_POINTS = (
+    50  #: A run of 10 s; of a shorter one, noise and a shift of clocks may look like a mistake
+)
+WHEELS = "the wheels"
+#: Factors of usual mistakes.
+SPEED_FACTORS: Mapping[str, float] = {"km/h": 3.6, "cm": 100.0, "mm": 1000.0}
+GNSS_FACTORS: Mapping[str, float] = {"knots": 1.9438}
+TURN_FACTORS: Mapping[str, float] = {"degrees": 57.2958, "rpm": 9.5493}
+WITHIN = 1.15  #: A ratio is that of a mistake within this factor: slip and scales are on top
+
+
+class Described(NamedTuple):
+    """What is known of the robot of a run: NaN, infinite or None where nothing is."""
+
+    track_m: float = math.nan
+    speed_max_mps: float = math.inf
+    twist: Stream | None = None  #: of the body by its wheels, as if they rolled without slip
+    sideways: bool | None = None  #: whether it can drive sideways
+    wheel_radius_m: float = math.nan
+    reduction_ratio: float = math.nan
+    length_m: float = math.nan  #: the larger of track and wheelbase
+    front_driven: bool = False  #: whether the steered wheel drives, which may turn beyond a right angle
+    steering_rate_max_radps: float = math.nan
+    current_max_a: float = math.inf
+    #: part of the speeds of steered wheels that no twist of the body explains: as logged, and with angles turned
+    contradiction: tuple[float, float] = (math.nan, math.nan)
+
+
+class Finding(NamedTuple):
+    """What two sensors, or one, show: how bad it is (0 sound, 1 doubtful, 2 implausible, -1 unknown)."""
+
+    check: str
+    level: int
+    place: str
+    measured: float
+    sentence: str
+
+
+class Seen(NamedTuple):
+    """A motion as a source sees it, on the grid of the run; NaN where it does not."""
+
+    name: str
+    velocity_mps: Array | None = (
+        None  #: (n, 2), along the body's axes or in a fixed frame, or (n, 3) in a camera's
+    )
+    in_body: bool = False
+    yaw_rate_radps: Array | None = None  #: (n,)
+    power: Array | None = None  #: squared speed of a course, by which its turn is weighted
+
+
+def motion_findings(run: RunLog, robot: Described) -> list[Finding]:
+    """Return what the sensors of a run that see its motion show of each other.
+
+    Examples
+    --------
+    A camera in km/h beside wheels in m/s:
+
+    >>> t = np.arange(0.0, 30.0, 0.1)
+    >>> v = np.column_stack([0.5 + 0.4 * np.sin(t), 0.0 * t, 0.0 * t])
+    >>> camera = Stream(t, 3.6 * v, ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"))
+    >>> run = RunLog("a", "husky", {"odometry": camera})
+    >>> [found.sentence for found in motion_findings(run, Described(twist=Stream(t, v, camera.channels)))
+    ...  if found.level == 2]
+    ['speed: that of odometry is 3.6 times that of the wheels, 0.3 to 1.5 is expected: km/h?']
+    """
+    grid_s = _grid(run)
+    if len(grid_s) < MIN_POINTS:
+        return []
+    sources = _sources(run, robot, grid_s)
+    return [
+        *_speeds(sources, robot),
+        *_yaw_rates(sources, robot),
+        *_directions(sources, robot),
+        *_still_positions(run, sources),
+        *_attitude(run, grid_s),
+        *_steering(run, robot),
+        *_receiver(run),
+        *_currents(run, robot),
+    ]
+
+
+# -- What each sensor shows, a mean of a second ---------------------------------------------------------------
+
+
+def _grid(run: RunLog) -> Array:
+    if not run.streams:
+        return np.empty(0)
+    start_s = min(float(stream.time_s[0]) for stream in run.streams.values())
+    end_s = max(float(stream.time_s[-1]) for stream in run.streams.values())
+    n = int(min((end_s - start_s) / STEP_S, 50_000))
+    return start_s + STEP_S * np.arange(1, max(n, 1))
+
+
+def _integral(time_s: Array, values: Array) -> Array:
+    return np.concatenate([[0.0], np.cumsum(np.diff(time_s) * 0.5 * (values[1:] + values[:-1]))])
+
+
+def _change(time_s: Array, values: Array, grid_s: Array, *, of_rate: bool) -> Array:
+    """Return the mean rate (n,) over a second about each instant; NaN at gaps and beyond the ends."""
+    known = np.isfinite(values)
+    t, x = time_s[known], values[known]
+    if len(t) < MIN_POINTS:
+        return np.full(len(grid_s), np.nan)
+    x = _integral(t, x) if of_rate else x
+    before_s, after_s = grid_s - MEAN_S / 2, grid_s + MEAN_S / 2
+    rate = (np.interp(after_s, t, x) - np.interp(before_s, t, x)) / MEAN_S
+    there = (before_s >= t[0]) & (after_s <= t[-1])
+    first, last = np.searchsorted(t, before_s, "right") - 1, np.searchsorted(t, after_s, "left")
+    widest_s = np.diff(t)
+    gaps = np.concatenate([[0], np.cumsum(widest_s > max(2.0 * MEAN_S, 3.0 * float(np.median(widest_s))))])
+    n = len(t) - 1
+    there &= gaps[np.clip(last, 0, n)] == gaps[np.clip(first, 0, n)]
+    return np.where(there, rate, np.nan)
+
+
+def _angle_rate(time_s: Array, angle: Array, grid_s: Array) -> Array:
+    """Return the rate of an angle, in its own unit; a jump by a turn of rad or of degrees is none."""
+    known = np.isfinite(angle)
+    t, step = time_s[known], np.diff(angle[known])
+    for turn in (2.0 * np.pi, 360.0):
+        wrap = np.abs(np.abs(step) - turn) < 0.2 * turn
+        step = np.where(wrap, step - np.sign(step) * turn, step)
+    return _change(t, np.concatenate([[0.0], np.cumsum(step)]), grid_s, of_rate=False)
+
+
+def _plane(stream: Stream, names: Sequence[str], grid_s: Array, *, of_rate: bool) -> Array | None:
+    if not set(names) <= set(stream.channels):
+        return None
+    return np.column_stack(
+        [_change(stream.time_s, stream.channel(name), grid_s, of_rate=of_rate) for name in names]
+    )
+
+
+def _course(velocity_mps: Array) -> tuple[Array, Array]:
+    """Return the yaw rate of a course times its squared speed, and that."""
+    power = (velocity_mps**2).sum(axis=1)
+    turn = np.full(len(power), np.nan)
+    ahead, behind = velocity_mps[2:], velocity_mps[:-2]
+    now = velocity_mps[1:-1]
+    change = (ahead - behind) / (2.0 * STEP_S)
+    turn[1:-1] = now[:, 0] * change[:, 1] - now[:, 1] * change[:, 0]
+    return turn, power
+
+
+def _to_body(velocity_mps: Array, time_s: Array, yaw_rad: Array, grid_s: Array) -> Array:
+    """Return velocities (n, 2) of a fixed frame along the axes of a body of this yaw."""
+    known = np.isfinite(yaw_rad)
+    cos, sin = (np.interp(grid_s, time_s[known], each(yaw_rad[known])) for each in (np.cos, np.sin))
+    x, y = velocity_mps.T
+    return (
+        np.column_stack([cos * x + sin * y, cos * y - sin * x]) / np.maximum(np.hypot(cos, sin), 0.1)[:, None]
+    )
+
+
+SPEEDS, VELOCITIES = ("speed_x_mps", "speed_y_mps"), ("velocity_x_mps", "velocity_y_mps")
+POSITIONS = ("position_x_m", "position_y_m")
+
+
+def _sources(run: RunLog, robot: Described, grid_s: Array) -> list[Seen]:
+    sources = []
+    turn: Array | None
+    if (twist := robot.twist) is not None:
+        sides = "wheels" in run.streams and "speed_left_mps" in run.streams["wheels"].channels
+        turn = None if sides else _change(twist.time_s, twist.channel(TWIST[2]), grid_s, of_rate=True)
+        sources.append(Seen(WHEELS, _plane(twist, SPEEDS, grid_s, of_rate=True), True, turn))
+    for name in ("lidar", "odometry", "pose", "gnss", "imu", "compass"):
+        stream = run.streams.get(name)
+        if stream is None:
+            continue
+        has, t = set(stream.channels), stream.time_s
+        turn = None
+        if rate := next((each for each in ("gyro_z_radps", "yaw_rate_radps") if each in has), ""):
+            turn = _change(t, stream.channel(rate), grid_s, of_rate=True)
+        if name == "imu" and turn is not None:
+            sources.insert(0, Seen("the gyro", yaw_rate_radps=turn))
+            turn = None
+        if "yaw_rad" in has:
+            turn = _angle_rate(t, stream.channel("yaw_rad"), grid_s)
+        body = _plane(stream, SPEEDS, grid_s, of_rate=True)
+        if body is not None or turn is not None:
+            sources.append(Seen(name if name != "imu" else "the yaw of imu", body, True, turn))
+        if name == "odometry":  # in a camera's own frame, which is not flat
+            three = [f"velocity_{axis}_mps" for axis in "xyz"]
+            if (velocity := _plane(stream, three, grid_s, of_rate=True)) is not None:
+                sources.append(Seen("odometry", velocity))
+            continue
+        for words, names, of_rate in (("velocity", VELOCITIES, True), ("position", POSITIONS, False)):
+            velocity = _plane(stream, names, grid_s, of_rate=of_rate)
+            if velocity is not None:
+                course = _course(velocity)
+                if in_body := name == "pose" and "yaw_rad" in has:
+                    velocity = _to_body(velocity, t, stream.channel("yaw_rad"), grid_s)
+                one = name == "pose" or not set(VELOCITIES) <= has
+                sources.append(Seen(name if one else f"the {words} of {name}", velocity, in_body, *course))
+    return sources
+
+
+# -- Comparison -----------------------------------------------------------------------------------------------
+
+
+class Likeness(NamedTuple):
+    """How two signals compare at the shift at which they are most alike."""
+
+    cosine: float = 0.0  #: of the angle between them
+    ratio: float = math.nan  #: of their root mean squares, measured over reference
+    other: float = 0.0  #: the best cosine of the other sign
+    least: float = 0.0  #: the smaller of both root mean squares
+    n: int = 0
+
+    @property
+    def is_known(self) -> bool:
+        """Whether ratio and sign mean something."""
+        return abs(self.cosine) >= MIN_LIKENESS and self.other <= MAX_OTHER_LIKENESS
+
+
+def _compare(measured: Array, reference: Array, *, about_mean: bool = False) -> Likeness:
+    """Compare signals (n, c) at shifts of up to :data:`SHIFTS_S`; all columns count as one."""
+    fits = []
+    for shift in np.round(SHIFTS_S / STEP_S).astype(int).tolist():
+        a = measured[max(shift, 0) : len(measured) + min(shift, 0)]
+        b = reference[max(-shift, 0) : len(reference) + min(-shift, 0)]
+        both = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+        if (n := int(both.sum())) < MIN_POINTS:
+            continue
+        m, r = a[both], b[both]
+        of_m, of_r = (math.sqrt(float((each**2).sum()) / n) for each in (m, r))
+        if about_mean:
+            m, r = m - m.mean(axis=0), r - r.mean(axis=0)
+        cosine = float(agreement(m.reshape(-1, 1), r.reshape(-1, 1))[0][0])
+        fits.append(Likeness(cosine, of_m / of_r if of_r else math.inf, 0.0, min(of_m, of_r), n))
+    if not fits:
+        return Likeness()
+    best = max(fits, key=lambda fit: abs(fit.cosine))
+    return best._replace(other=max(-math.copysign(1.0, best.cosine) * fit.cosine for fit in fits))
+
+
+def mistake(ratio: float, factors: Mapping[str, float]) -> str:
+    """Return which mistake a ratio of two measurements of one thing comes from, as a question.
+
+    Examples
+    --------
+    >>> mistake(3.5, SPEED_FACTORS), mistake(1 / 60, TURN_FACTORS), mistake(7.0, TURN_FACTORS)
+    ('km/h?', 'degrees?', 'another unit, or scale?')
+    """
+    factor = max(ratio, 1.0 / ratio) if ratio > 0.0 else math.inf
+    near = min(factors, key=lambda name: abs(math.log(factor / factors[name])))
+    return f"{near}?" if 1.0 / WITHIN < factor / factors[near] < WITHIN else "another unit, or scale?"
+
+
+def _level(n: int, odd: bool | np.bool_, beyond: bool | np.bool_) -> int:
+    """Return how bad a comparison of n points is; of few points what is beyond all is doubtful, and no more."""
+    return int(odd) + int(odd and beyond) if n >= MIN_CERTAIN_POINTS else int(odd and beyond)
+
+
+def _speeds(sources: Sequence[Seen], robot: Described) -> list[Finding]:
+    """Compare the speeds of sources with that of the one in the middle, where the robot goes rather than turns."""
+    speed = {
+        each.name: np.linalg.norm(each.velocity_mps, axis=1)
+        for each in sources
+        if each.velocity_mps is not None
+    }
+    level = {}
+    for name, values in speed.items():
+        known = values[np.isfinite(values)]
+        level[name] = math.sqrt(float(np.mean(known**2))) if len(known) >= MIN_POINTS else math.nan
+    ranked = sorted((name for name in level if level[name] >= 0.0), key=lambda name: level[name])
+    if len(ranked) < 2:
+        return []
+    # of two the wheels are the reference; of more the one in the middle, or the one beside it where that is the wheels
+    middle = WHEELS if len(ranked) == 2 and WHEELS in ranked else ranked[(len(ranked) - 1) // 2]
+    if middle == WHEELS and len(ranked) > 2 and len(ranked) % 2 == 0:
+        middle = ranked[len(ranked) // 2]
+    factors = dict(SPEED_FACTORS)
+    if robot.wheel_radius_m > 0.0:
+        factors["wheels in rad/s"] = 1.0 / robot.wheel_radius_m
+    if robot.reduction_ratio > 1.0:
+        factors["rates before or after the reduction"] = robot.reduction_ratio
+    found = []
+    for name, values in speed.items():
+        if name == middle or name not in ranked:
+            continue
+        slow = np.minimum(values, speed[middle])
+        goes = _turn_speed(sources, robot) < 0.5 * slow
+        by = _compare(
+            *(np.where(goes, each, np.nan)[:, None] for each in (values, speed[middle])), about_mean=True
+        )
+        low, high, least, most = (
+            1.0 / DOUBTFUL_RATIO,
+            DOUBTFUL_RATIO,
+            1.0 / IMPLAUSIBLE_RATIO,
+            IMPLAUSIBLE_RATIO,
+        )
+        if middle == WHEELS:
+            low, least = LEAST_OF_WHEELS, IMPLAUSIBLE_OF_WHEELS
+        elif name == WHEELS:
+            high, most = 1.0 / LEAST_OF_WHEELS, 1.0 / IMPLAUSIBLE_OF_WHEELS
+        if not math.isfinite(by.ratio) or by.least * max(by.ratio, 1.0 / by.ratio) < MIN_SPEED_MPS:
+            continue
+        of = f"speed: that of {name} is {by.ratio:.3g} times that of {middle}"
+        known = factors | dict(GNSS_FACTORS if "gnss" in (name + middle) else {})
+        odd = f"{of}, {low:.2g} to {high:.2g} is expected: {mistake(by.ratio, known)}"
+        beyond = by.cosine >= MIN_LIKENESS and not least <= by.ratio <= most
+        judged = _level(by.n, not low <= by.ratio <= high, beyond)
+        place = WHEELS if WHEELS in (name, middle) and len(ranked) == 2 else name
+        found.append(Finding("speed", judged, place, by.ratio, odd if judged else of))
+    return found
+
+
+def _turn_speed(sources: Sequence[Seen], robot: Described) -> Array:
+    """Return the speed (n,) that the ends of the robot have by its turning alone; 0 where no turn is seen."""
+    rates = [
+        each.yaw_rate_radps for each in sources if each.yaw_rate_radps is not None and each.power is None
+    ]
+    if not rates:
+        return np.zeros(1)
+    length_m = robot.length_m if math.isfinite(robot.length_m) else 1.0
+    return np.asarray(length_m * np.abs(np.nan_to_num(np.column_stack(rates))).min(axis=1))
+
+
+def _yaw_rates(sources: Sequence[Seen], robot: Described) -> list[Finding]:
+    """Compare the yaw rates of sources, and the turns of courses, with the first: the gyro's where there is one."""
+    turning = [each for each in sources if each.yaw_rate_radps is not None]
+    reference = next((each for each in turning if each.power is None and each.name != WHEELS), None)
+    if reference is None or reference.yaw_rate_radps is None:
+        return []
+    rate = reference.yaw_rate_radps
+    judged: list[tuple[Seen, float, int]] = []
+    for seen in turning:
+        of_course = seen.power is not None
+        if seen is reference or (of_course and robot.sideways is not False):
+            continue
+        assert seen.yaw_rate_radps is not None
+        weight, measured = np.ones_like(rate), seen.yaw_rate_radps
+        if seen.power is not None:
+            norm = max(float(np.nanmean(seen.power)) if np.isfinite(seen.power).any() else 0.0, 1e-12)
+            weight, measured = seen.power / norm, measured / norm
+        by = _compare(measured[:, None], (rate * weight)[:, None])
+        sure = by.is_known and (not of_course or by.n >= MIN_CERTAIN_POINTS)
+        larger = by.least * max(by.ratio, 1.0 / by.ratio) if sure else 0.0
+        # a sign is that of two turns, not of a turn and what a robot that does not mean to turn shows, as wheels do
+        both = by.least >= MIN_TURN_RADPS / 2
+        if larger >= MIN_TURN_RADPS and (both or (by.cosine > 0.0 and seen.name != WHEELS)):
+            judged.append((seen, math.copysign(by.ratio, by.cosine), by.n))
+    contradict = [not 1.0 / IMPLAUSIBLE_RATIO <= factor <= IMPLAUSIBLE_RATIO for _, factor, _ in judged]
+    signs = {math.copysign(1.0, factor) for _, factor, _ in judged}
+    if len(judged) > 1 and all(contradict) and len(signs) == 1:  # all others contradict the first
+        factor = 1.0 / float(np.median([factor for _, factor, _ in judged]))
+        others = Seen(" and ".join(each.name for each, *_ in judged))
+        return [_turned(reference, others, factor, min(n for *_, n in judged))]
+    return [_turned(seen, reference, factor, n) for seen, factor, n in judged]
+
+
+def _turned(seen: Seen, reference: Seen, factor: float, n: int) -> Finding:
+    what = "turn of the course" if seen.power is not None else "yaw rate"
+    of = f"turns: the {what} of {seen.name} is {factor:.3g} times that of {reference.name}"
+    low, high, bound = 1.0 / DOUBTFUL_TURN_RATIO, DOUBTFUL_TURN_RATIO, IMPLAUSIBLE_RATIO
+    if WHEELS in (seen.name, reference.name):  # they slip, and the front of a car pushes on
+        low, high, bound = 1.0 / IMPLAUSIBLE_RATIO, IMPLAUSIBLE_RATIO, IMPLAUSIBLE_RATIO**2
+    why = mistake(factor, TURN_FACTORS)
+    if factor < 0.0:
+        why = "a turned sign, or axis?"
+        if seen.power is not None:
+            why = "x and y exchanged (x is east, y north), or a turned axis?"
+        elif WHEELS in (seen.name, reference.name):
+            why = "a turned sign of the steering or of the gyro, or wheels exchanged?"
+    elif low <= factor <= high or seen.power is not None:
+        return Finding("turns", 0, seen.name, factor, of)
+    certain = n >= MIN_CERTAIN_POINTS and not 1.0 / bound <= factor <= bound
+    return Finding(
+        "turns", 1 + certain, seen.name, factor, f"{of}, {low:.2g} to {high:.2g} is expected: {why}"
+    )
+
+
+def _directions(sources: Sequence[Seen], robot: Described) -> list[Finding]:
+    """Compare velocities along the body's axes: of a robot that cannot drive sideways with x, and with the wheels'."""
+    found = []
+    wheels = next((each.velocity_mps for each in sources if each.name == WHEELS), None)
+    columns = 2 if robot.sideways else 1
+    for seen in sources:
+        if seen.velocity_mps is None or not seen.in_body or seen.name == WHEELS:
+            continue
+        speed = np.hypot(*seen.velocity_mps.T)
+        goes = (speed > MIN_SPEED_MPS) & (_turn_speed(sources, robot) < 0.5 * speed)
+        if goes.sum() < MIN_POINTS:
+            continue
+        v = np.where(goes[:, None], seen.velocity_mps, np.nan)
+        power = np.nansum(v**2, axis=0)
+        ahead = float(power[0] / power.sum())
+        of = f"direction: {100 * ahead:.0f} % of the motion of {seen.name} is along the robot's x axis"
+        by = Likeness() if wheels is None else _compare(v[:, :columns], wheels[:, :columns])
+        n = int(goes.sum())
+        level = _level(n, ahead < MIN_AHEAD[0], ahead < MIN_AHEAD[1]) if robot.sideways is False else 0
+        if level:
+            odd = f"{of}, which cannot drive sideways: axes exchanged, or a yaw off by 90 degrees?"
+            found.append(Finding("direction", level, seen.name, ahead, odd))
+        elif by.is_known and by.cosine < 0.0:
+            odd = f"direction: {seen.name} moves against the wheels: a turned sign, or a yaw off by 180 degrees?"
+            found.append(Finding("direction", _level(by.n, True, True), seen.name, by.cosine, odd))
+        elif robot.sideways is False or by.is_known:
+            found.append(Finding("direction", 0, seen.name, ahead, of))
+    return found
+
+
+def _still_positions(run: RunLog, sources: Sequence[Seen]) -> list[Finding]:
+    """Return streams whose positions hardly move while the wheels drive for metres: degrees."""
+    wheels = next((seen.velocity_mps for seen in sources if seen.name == WHEELS), None)
+    if wheels is None or not np.isfinite(wheels).any():
+        return []
+    driven_m = float(np.nansum(np.hypot(*wheels.T)) * STEP_S)
+    found = []
+    for name in ("gnss", "pose"):
+        stream = run.streams.get(name)
+        if stream is None or not set(POSITIONS) <= set(stream.channels) or driven_m < 2.0:
+            continue
+        spread_m = float(
+            np.nanmax(
+                np.ptp(stream.columns(POSITIONS)[np.isfinite(stream.columns(POSITIONS)).all(axis=1)], axis=0),
+                initial=0.0,
+            )
+        )
+        if 0.0 < spread_m < STILL_M:
+            odd = f"position: {name} stays within {spread_m:.2g} m while the wheels drive {driven_m:.3g} m: in degrees?"
+            found.append(Finding("position", 2, name, spread_m, odd))
+    return found
+
+
+# -- Sensors by themselves ------------------------------------------------------------------------------------
+
+
+def _quantile(values: Array, part: float = 0.99) -> float:
+    known = np.abs(values[np.isfinite(values)])
+    return float(np.quantile(known, part)) if known.size else math.nan
+
+
+def _attitude(run: RunLog, grid_s: Array) -> list[Finding]:
+    """Compare roll and pitch with what gravity shows along x and y: ``-g sin(pitch)`` and ``g sin(roll)``."""
+    imu = run.streams.get("imu")
+    found = []
+    for name, axis, sign in (("pitch_rad", "x", -1.0), ("roll_rad", "y", 1.0)):
+        if imu is None or name not in imu.channels:
+            continue
+        largest = _quantile(imu.channel(name))
+        if largest > 1.1 * np.pi:
+            odd = f"attitude: {name} of imu reaches {largest:.3g} rad, {np.pi:.3g} is the most: in degrees?"
+            found.append(Finding("attitude", 2, name, largest, odd))
+            continue
+        if f"accel_{axis}_mps2" not in imu.channels:
+            continue
+        force = _change(imu.time_s, imu.channel(f"accel_{axis}_mps2"), grid_s, of_rate=True) / 9.81
+        angle = sign * _change(imu.time_s, imu.channel(name), grid_s, of_rate=True)
+        by = _compare(angle[:, None], force[:, None])
+        like, ratio = by.cosine, by.ratio
+        if abs(like) < MIN_LIKENESS or by.least * max(ratio, 1.0 / ratio) < MIN_TILT_RAD:
+            continue
+        of = f"attitude: {name} of imu is {math.copysign(ratio, like):.3g} times the tilt that gravity shows"
+        if like < 0.0:
+            found.append(
+                Finding(
+                    "attitude", 2, name, -ratio, f"{of}: a turned sign (z up, nose up is a negative pitch)?"
+                )
+            )
+        elif ratio > 10.0:
+            found.append(Finding("attitude", 2, name, ratio, f"{of}: in degrees?"))
+        else:
+            found.append(Finding("attitude", 0, name, ratio, of))
+    return found
+
+
+def _steering(run: RunLog, robot: Described) -> list[Finding]:
+    stream = run.streams.get("steering")
+    if stream is None or len(stream) < MIN_POINTS:
+        return []
+    found = []
+    given, turned = robot.contradiction
+    if given > CONTRADICTION and given > OVER_TURNED * turned:
+        odd = (
+            f"steering: no motion explains {100 * given:.0f} % of the speeds of the wheels, and all but "
+            f"{100 * turned:.0f} % with angles of the other sign: a turned sign of the steering?"
+        )
+        found.append(Finding("steering", _level(len(stream), True, True), "steering", given, odd))
+    fastest = (
+        5.0 * robot.steering_rate_max_radps if robot.steering_rate_max_radps > 0.0 else STEERING_RATE_RADPS
+    )
+    for channel in stream.channels:
+        if not channel.startswith("angle_"):
+            continue
+        angle = stream.channel(channel)
+        rate, largest = _quantile(np.diff(angle) / np.diff(stream.time_s), 0.995), _quantile(angle)
+        steepest = 1.1 * np.pi if robot.front_driven else 0.55 * np.pi
+        if robot.sideways is False and largest > steepest:
+            odd = f"steering: {channel} reaches {largest:.3g} rad, {steepest:.3g} is the most: in degrees?"
+            found.append(Finding("steering", 2, channel, largest, odd))
+        elif rate > max(fastest, 3.0):
+            odd = (
+                f"steering: {channel} turns by up to {rate:.3g} rad/s, {fastest:.3g} is the most: in degrees?"
+            )
+            found.append(Finding("steering", 2 if largest > np.pi else 1, channel, rate, odd))
+        else:
+            found.append(
+                Finding("steering", 0, channel, rate, f"steering: {channel} turns by up to {rate:.3g} rad/s")
+            )
+    return found
+
+
+def _receiver(run: RunLog) -> list[Finding]:
+    """Return what is odd about the fix and the deviation that a receiver states."""
+    gnss = run.streams.get("gnss")
+    if gnss is None:
+        return []
+    found = []
+    fix = gnss.channel("fix_ratio") if "fix_ratio" in gnss.channels else np.full(len(gnss), np.nan)
+    if (largest := _quantile(fix, 1.0)) > 1.0:
+        odd = f"receiver: fix_ratio reaches {largest:.3g}, 1 is the most: codes of NMEA?"
+        found.append(Finding("receiver", 2, "fix_ratio", largest, odd))
+    if "std_position_m" in gnss.channels:
+        std = gnss.channel("std_position_m")
+        fixed = std[(fix > 0.9) & (fix <= 1.0) & np.isfinite(std)]
+        if fixed.size and (middle := float(np.median(fixed))) > MAX_STD_OF_FIX_M:
+            odd = f"receiver: std_position_m is {middle:.3g} m with an RTK fix, some cm are expected: in mm or cm?"
+            found.append(Finding("receiver", 1, "std_position_m", middle, odd))
+    return found
+
+
+def _currents(run: RunLog, robot: Described) -> list[Finding]:
+    wheels = run.streams.get("wheels")
+    if wheels is None or not math.isfinite(robot.current_max_a):
+        return []
+    names = [name for name in wheels.channels if name.startswith("current_") and name.endswith("_a")]
+    largest = _quantile(wheels.columns(names)) if names else math.nan
+    of = (
+        f"current: up to {largest:.3g} A, the motors take {robot.current_max_a:.3g} A at their largest torque"
+    )
+    if not math.isfinite(largest):
+        return []
+    level = 2 if largest > 30.0 * robot.current_max_a else int(largest > 3.0 * robot.current_max_a)
+    return [Finding("current", level, "wheels", largest, of + (": in mA?" if level else ""))]

@@ -1,0 +1,174 @@
+"""Errors of unit, sign, axis and size, planted in simulated runs of every kind of drive, and what is stated.
+
+Each run is sound as it is, so that what is found is the error; the robot of the run is the one that was simulated, but
+where another is planted.
+"""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from pipelines.data.datasets import verdict
+from terrain.kinematics.logged_wheels import with_wheel_speeds
+from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
+
+DEGREE = np.pi / 180.0
+DRIVES = {
+    "husky": ("grass", "complex"),
+    "orchard_ugv": ("grass", "complex"),
+    "agrimaro": ("grass", "complex"),
+    "robotino": ("tiles", "complex"),
+    "adap2e": ("grass", "complex"),
+    "pallet_truck": ("tiles", "survey"),
+}
+
+
+def judged(run, robot=None):
+    """Return the checks of a run as a reader gives it, with the speeds of wheels whose motors are logged."""
+    robot = robot or load_robot(run.robot)
+    return verdict(with_wheel_speeds(run, robot), robot)
+
+
+@cache
+def sound(robot):
+    run = simulate_run(load_robot(robot), *DRIVES[robot], 0, 1, duration_s=40.0)
+    return replace(run, streams={name: run.streams[name] for name in run.streams if name != "truth"})
+
+
+def scaled(stream, factor, *starts):
+    """Return what multiplies the channels of a stream that begin with some words."""
+
+    def change(run):
+        old = run.streams[stream]
+        by = [factor if name.startswith(starts) else 1.0 for name in old.channels]
+        return replace(run, streams={**run.streams, stream: replace(old, values=old.values * by)})
+
+    return change
+
+
+def exchanged(stream, *pairs):
+    """Return what exchanges channels of a stream, two and two."""
+
+    def change(run):
+        old = run.streams[stream]
+        new = dict(zip(old.channels, old.channels, strict=True))
+        for a, b in pairs:
+            new[a], new[b] = b, a
+        values = old.columns([new[name] for name in old.channels])
+        return replace(run, streams={**run.streams, stream: replace(old, values=values)})
+
+    return change
+
+
+def shifted(stream, channel, by):
+    def change(run):
+        old = run.streams[stream]
+        values = old.values + by * (np.array(old.channels) == channel)
+        return replace(run, streams={**run.streams, stream: replace(old, values=values)})
+
+    return change
+
+
+def retimed(factor):
+    def change(run):
+        streams = {name: replace(each, time_s=each.time_s * factor) for name, each in run.streams.items()}
+        return replace(run, streams=streams)
+
+    return change
+
+
+def all_fixed(run):
+    """Return a run whose receiver has an RTK fix, with the code of NMEA for it."""
+    old = run.streams["gnss"]
+    values = np.where(np.array(old.channels) == "fix_ratio", 4.0, old.values)
+    return replace(run, streams={**run.streams, "gnss": replace(old, values=values)})
+
+
+BAD, ODD = "implausible", "doubtful"
+NORTH = ("position_x_m", "position_y_m"), ("velocity_x_mps", "velocity_y_mps")
+PLANTED = [
+    # robot, what is done, how bad it is, what is said of it
+    ("husky", scaled("imu", 1 / DEGREE, "gyro"), BAD, "a gyro in deg/s read as rad/s?"),
+    ("husky", scaled("imu", 1 / 9.81, "accel"), BAD, "an accelerometer in g read as m/s^2?"),
+    ("husky", scaled("imu", -1.0, "accel_z"), BAD, "z points down?"),
+    ("husky", scaled("imu", -1.0, "gyro_z"), BAD, "turned sign of the gyro, or sides swapped"),
+    ("husky", exchanged("wheels", ("speed_left_mps", "speed_right_mps")), BAD, "sides swapped"),
+    ("husky", scaled("wheels", 1 / 0.165, "speed"), BAD, "rad/s or km/h read as m/s?"),
+    ("husky", scaled("wheels", 3.6, "speed"), ODD, "rad/s or km/h read as m/s?"),
+    ("husky", scaled("wheels", 1e3, "current"), BAD, "in mA?"),
+    ("husky", retimed(1e3), BAD, "ms read as s?"),
+    ("husky", scaled("odometry", 3.6, "speed"), BAD, "km/h?"),
+    ("husky", scaled("odometry", 1e3, "speed"), BAD, "mm?"),
+    ("husky", scaled("odometry", -1.0, "speed"), BAD, "odometry moves against the wheels"),
+    ("husky", exchanged("odometry", ("speed_x_mps", "speed_y_mps")), BAD, "axes exchanged"),
+    ("husky", scaled("imu", 1 / DEGREE, "yaw"), BAD, "the yaw of imu is"),
+    ("agrimaro", scaled("imu", 1 / DEGREE, "roll", "pitch"), BAD, "in degrees?"),
+    ("agrimaro", scaled("imu", -1.0, "roll"), BAD, "roll_rad of imu is -0.8"),
+    ("orchard_ugv", scaled("pose", 1e3, "position"), BAD, "speed: that of pose is 999 times"),
+    ("orchard_ugv", scaled("pose", 1e2, "position"), BAD, "cm?"),
+    (
+        "orchard_ugv",
+        scaled("pose", 1 / DEGREE, "yaw"),
+        BAD,
+        "the yaw rate of pose is 57.3 times that of the gyro",
+    ),
+    ("orchard_ugv", scaled("pose", -1.0, "yaw"), BAD, "the yaw rate of pose is -1 times"),
+    ("orchard_ugv", shifted("pose", "yaw_rad", np.pi / 2), BAD, "a yaw off by 90 degrees?"),
+    ("orchard_ugv", shifted("pose", "yaw_rad", np.pi), BAD, "a yaw off by 180 degrees?"),
+    ("orchard_ugv", exchanged("gnss", *NORTH), BAD, "x and y exchanged (x is east, y north)"),
+    ("orchard_ugv", scaled("gnss", 1 / 111_000.0, "position"), BAD, "in degrees?"),
+    ("orchard_ugv", scaled("gnss", 1e3, "position"), BAD, "mm?"),
+    ("orchard_ugv", scaled("gnss", 3.6, "velocity"), BAD, "km/h?"),
+    ("orchard_ugv", scaled("gnss", 1.9438, "velocity"), ODD, "knots?"),
+    ("orchard_ugv", all_fixed, BAD, "codes of NMEA"),
+    ("orchard_ugv", scaled("gnss", 1e3, "std"), ODD, "in mm or cm?"),
+    ("orchard_ugv", scaled("compass", -1.0, "yaw"), BAD, "the yaw rate of compass is -1 times"),
+    ("agrimaro", scaled("steering", 1 / DEGREE, "angle"), BAD, "in degrees?"),
+    ("agrimaro", scaled("steering", -1.0, "angle"), BAD, "a turned sign of the steering"),
+    ("agrimaro", scaled("wheels", 0.1, "motor"), BAD, "before or after the reduction"),
+    ("agrimaro", scaled("wheels", 60 / (2 * np.pi), "motor"), BAD, "rpm?"),
+    ("agrimaro", scaled("odometry", 1e3, "velocity"), BAD, "mm?"),
+    ("robotino", scaled("wheels", 1 / 16.0, "motor"), BAD, "before or after the reduction"),
+    ("robotino", scaled("pose", 1e3, "position"), BAD, "mm?"),
+    ("robotino", scaled("pose", -1.0, "yaw"), BAD, "a turned sign"),
+    ("adap2e", scaled("steering", 1 / DEGREE, "angle"), BAD, "in degrees?"),
+    ("adap2e", scaled("steering", -1.0, "angle"), BAD, "a turned sign of the steering"),
+    ("adap2e", scaled("imu", 1 / DEGREE, "gyro"), BAD, "degrees?"),
+    ("adap2e", scaled("imu", -1.0, "gyro_z"), BAD, "a turned sign"),
+    ("adap2e", scaled("wheels", 3.6, "speed"), ODD, "km/h?"),
+    ("pallet_truck", exchanged("gnss", *NORTH), BAD, "x and y exchanged"),
+    ("pallet_truck", scaled("odometry", 3.6, "speed"), BAD, "km/h?"),
+]
+
+
+@pytest.mark.parametrize("robot", DRIVES)
+def test_a_sound_run_of_each_drive_has_no_doubt(robot):
+    assert [check for check in judged(sound(robot)) if check.level in (BAD, ODD)] == []
+
+
+@pytest.mark.parametrize(("robot", "plant", "level", "sentence"), PLANTED)
+def test_a_planted_error_is_refused_or_stated_in_a_sentence_that_names_it(robot, plant, level, sentence):
+    run = plant(sound(robot))
+    said = [check for check in judged(run) if check.level in (BAD, ODD)]
+    assert any(sentence in check.sentence for check in said if check.level == level), said
+
+
+@pytest.mark.parametrize(
+    ("robot", "change", "sentence"),
+    [
+        (
+            "husky",
+            {"track_m": 1.4},
+            "another track?",
+        ),  # its effective track is less than half of the described
+        ("robotino", {"wheel_radius_m": 0.02}, "speed: that of pose is 2"),
+        ("adap2e", {"wheelbase_m": 0.3}, "turns: the yaw rate of the wheels is "),
+    ],
+)
+def test_a_robot_of_another_size_than_the_logs_is_stated(robot, change, sentence):
+    other = replace(load_robot(robot), **change)
+    said = [check for check in judged(sound(robot), other) if check.level in (BAD, ODD)]
+    assert any(sentence in check.sentence for check in said), said
