@@ -388,8 +388,8 @@ def _yaw_rates(sources: Sequence[Seen], robot: Described) -> list[Finding]:
             norm = max(float(np.nanmean(seen.power)) if np.isfinite(seen.power).any() else 0.0, 1e-12)
             weight, measured = seen.power / norm, measured / norm
         by = _compare(measured[:, None], (rate * weight)[:, None])
-        sure = by.is_known and (not of_course or by.n >= MIN_CERTAIN_POINTS)
-        larger = by.least * max(by.ratio, 1.0 / by.ratio) if sure else 0.0
+        is_certain = by.is_known and (not of_course or by.n >= MIN_CERTAIN_POINTS)
+        larger = by.least * max(by.ratio, 1.0 / by.ratio) if is_certain else 0.0
         # a sign is that of two turns, not of a turn and what a robot that does not mean to turn shows, as wheels do
         both = by.least >= MIN_TURN_RADPS / 2
         if larger >= MIN_TURN_RADPS and (both or (by.cosine > 0.0 and seen.name != WHEELS)):

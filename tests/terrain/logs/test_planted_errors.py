@@ -90,7 +90,7 @@ def all_fixed(run):
 BAD, ODD = "implausible", "doubtful"
 NORTH = ("position_x_m", "position_y_m"), ("velocity_x_mps", "velocity_y_mps")
 PLANTED = [
-    # robot, what is done, how bad it is, what is said of it
+    # robot, what is done, how bad it is, what is stated of it
     ("husky", scaled("imu", 1 / DEGREE, "gyro"), BAD, "a gyro in deg/s read as rad/s?"),
     ("husky", scaled("imu", 1 / 9.81, "accel"), BAD, "an accelerometer in g read as m/s^2?"),
     ("husky", scaled("imu", -1.0, "accel_z"), BAD, "z points down?"),
@@ -152,8 +152,8 @@ def test_a_sound_run_of_each_drive_has_no_doubt(robot):
 @pytest.mark.parametrize(("robot", "plant", "level", "sentence"), PLANTED)
 def test_a_planted_error_is_refused_or_stated_in_a_sentence_that_names_it(robot, plant, level, sentence):
     run = plant(sound(robot))
-    said = [check for check in judged(run) if check.level in (BAD, ODD)]
-    assert any(sentence in check.sentence for check in said if check.level == level), said
+    stated = [check for check in judged(run) if check.level in (BAD, ODD)]
+    assert any(sentence in check.sentence for check in stated if check.level == level), stated
 
 
 @pytest.mark.parametrize(
@@ -161,7 +161,7 @@ def test_a_planted_error_is_refused_or_stated_in_a_sentence_that_names_it(robot,
     [
         (
             "husky",
-            {"track_m": 1.4},
+            {"track_m": 2.8},
             "another track?",
         ),  # its effective track is less than half of the described
         ("robotino", {"wheel_radius_m": 0.02}, "speed: that of pose is 2"),
@@ -170,5 +170,5 @@ def test_a_planted_error_is_refused_or_stated_in_a_sentence_that_names_it(robot,
 )
 def test_a_robot_of_another_size_than_the_logs_is_stated(robot, change, sentence):
     other = replace(load_robot(robot), **change)
-    said = [check for check in judged(sound(robot), other) if check.level in (BAD, ODD)]
-    assert any(sentence in check.sentence for check in said), said
+    stated = [check for check in judged(sound(robot), other) if check.level in (BAD, ODD)]
+    assert any(sentence in check.sentence for check in stated), stated
