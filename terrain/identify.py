@@ -181,7 +181,9 @@ def identify(
     unseen = np.diag(np.eye(len(value)) - inverse @ normal) > UNSEEN  # nothing that is measured depends on it
     std = np.where(unseen, math.inf, np.sqrt(np.diag(cov)))
     half = half_width(std, dof)
-    identified = ~at_bound & ~unseen & ~(std >= IDENTIFIED_RATIO * prior_std)
+    # of clusters that all say nothing, what leaving one out moves is nothing too: the curvature has to narrow it
+    narrowed = np.maximum(std, np.sqrt(np.diag(inverse)) * unit)
+    identified = ~at_bound & ~unseen & ~(narrowed >= IDENTIFIED_RATIO * prior_std)
     interval = np.stack([value - half, value + half])
     return Fit(
         tuple(parameters), value, cov, interval, identified, at_bound, influence, left, float(best.cost)

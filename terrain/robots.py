@@ -860,8 +860,7 @@ KIND_OF_DRIVE: dict[str, type[Robot]] = {
 }
 
 #: Numbers of the section ``identified``, which logs of one robot showed and no nominal figure is: the least
-#: value of each, None for above zero (:mod:`terrain.calibration.skid_steer`, :mod:`terrain.calibration.omni`,
-#: :mod:`terrain.calibration.poses`).
+#: value of each, None for above zero (:mod:`terrain.calibration`).
 IDENTIFIED: Mapping[str, float | None] = {
     "rolling_radius_m": None,
     "effective_track_m": None,
@@ -877,6 +876,16 @@ IDENTIFIED: Mapping[str, float | None] = {
     "pose_y_m": -math.inf,
     "pose_yaw_rad": -math.inf,
     "pose_delay_s": -math.inf,
+    "gnss_delay_s": -math.inf,
+    "odometry_delay_s": -math.inf,
+    "gyro_scale_ratio": None,
+    "imu_roll_rad": -math.inf,
+    "imu_pitch_rad": -math.inf,
+    "imu_yaw_rad": -math.inf,
+    "gnss_std_m": None,
+    "wheel_speed_std_mps": None,
+    "torque_per_current_nmpa": None,
+    "resistance_n": None,
 }
 
 
@@ -965,8 +974,12 @@ def robot_from(file: str, described: Any) -> Robot:
             entries |= {f"{section}.{key}": entry for key, entry in described[section].items()}
     assumed = frozenset(k for k, e in entries.items() if e["source"].strip().lower().startswith("assumed"))
     shown_by_logs, filters = described.get("identified", {}), described.get("filters", [])
-    check_keys(f"{file}: identified", shown_by_logs, [], optional=tuple(IDENTIFIED))
-    lows = {key: IDENTIFIED[key] for key in shown_by_logs}
+    # an effective track is one of a ground, or of a kind of turn: ``effective_track_grass_m``, ``effective_track_tight_m``
+    of_ground = [
+        key for key in shown_by_logs if f"{key}".startswith("effective_track_") and f"{key}".endswith("_m")
+    ]
+    check_keys(f"{file}: identified", shown_by_logs, [], optional=(*IDENTIFIED, *of_ground))
+    lows = {key: IDENTIFIED.get(key) for key in shown_by_logs}
     identified = numbers(f"{file}: identified", shown_by_logs, lows)
     if not isinstance(filters, list) or not all(isinstance(name, str) and name for name in filters):
         raise ConfigError(f"{file}: filters is {shown(filters)}, a list of names is required")

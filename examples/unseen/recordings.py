@@ -3,14 +3,13 @@
 python examples/unseen/recordings.py [DATA/drive_recordings] [--out recordings]
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 from second_half import answer, table
 
 from pipelines.data.datasets import load_runs
 from pipelines.explain.explain import explain
-from terrain.calibration.skid_steer import identify
+from terrain.calibration.motion import findings_by, fit_motion
 from terrain.files.atomic import ensure_writable
 from terrain.records import RunLog
 from terrain.robots import load_robot
@@ -26,9 +25,8 @@ def main(data: Path, out: Path | None = None) -> list[str]:
             of_it = sorted((run for run in own if run.session == session), key=lambda run: run.run_id)
             first += of_it[: len(of_it) // 2]
             second += of_it[len(of_it) // 2 :]
-        # without labels, so that runs on grass count and the slip of soft ground is in the intervals
-        bare = ([replace(run, labels=()) for run in part] for part in (first, second, own))
-        parts = [identify(part, robot.wheel_radius_m, ()) for part in bare]
+        # the slip of soft ground is in the intervals
+        parts = [findings_by(fit_motion(part, robot, "lidar"), robot) for part in (first, second, own)]
         print(
             f"{name} on {terrain}: {len(own)} runs of {len({run.session for run in own})} recordings; 95 % intervals"
         )

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipelines.explain.explain import explain
 from terrain.calibration.finding import Finding
-from terrain.calibration.poses import PoseFit, findings_by, fit_poses, leg_errors
+from terrain.calibration.motion import MotionFit, findings_by, fit_motion, leg_errors
 from terrain.effects import PARAMETER
 from terrain.errors import TerrainError
 from terrain.extension import extended_yaml
@@ -70,13 +70,15 @@ def table(first: Sequence[Finding], second: Sequence[Finding], whole: Sequence[F
     return verdicts
 
 
-def extended(fitted: PoseFit, robot: Robot, out: Path) -> Path:
+def extended(fitted: MotionFit, robot: Robot, out: Path) -> Path:
     """Write the robot with what its poses show built in, and return the file.
 
     Poses that are early, as of clocks that differ, are no property of the robot, and slip is the ground's.
     """
     within = [
-        PARAMETER[name].low <= value <= PARAMETER[name].high and name != "force_slip_ratio"
+        name in PARAMETER
+        and PARAMETER[name].low <= value <= PARAMETER[name].high
+        and name != "force_slip_ratio"
         for name, value in fitted.values.items()
     ]
     shown = [i for i, seen in enumerate(fitted.fit.identified) if seen and within[i]]
@@ -93,7 +95,7 @@ def show(runs: Sequence[RunLog], robot: Robot, out: Path | None) -> list[str]:
     """Print what poses show of a robot with the verdict of the second half; write robot and page where asked to."""
     first, second = halves(runs)
     fits = {
-        name: fit_poses(part, robot) for name, part in (("first", first), ("second", second), ("all", runs))
+        name: fit_motion(part, robot) for name, part in (("first", first), ("second", second), ("all", runs))
     }
     found = {name: findings_by(fit, robot) for name, fit in fits.items()}
     print(

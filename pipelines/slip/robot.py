@@ -48,7 +48,7 @@ def calibrate(settings: Settings, progress: Progress) -> CalibrationResult:
         if the robot's description is not accepted, lacks a section or has effects or learned terms, or ``out`` is there
         already or is no YAML file.
     DataError
-        if a run is another robot's, the runs show nothing, or those of a skid-steer robot have no lidar.
+        if a run is another robot's, or the runs show nothing.
     """
     assert settings.robot is not None
     path = description_file(settings.robot)

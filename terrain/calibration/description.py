@@ -11,10 +11,20 @@ import yaml
 
 from terrain.calibration.finding import Finding
 from terrain.calibration.lag import starts_and_stops, time_constants
+from terrain.calibration.motion import RADIUS, motion_findings
+from terrain.calibration.motors import motor_constant
 from terrain.calibration.omni import identify_omni
-from terrain.calibration.poses import kinematic_of, pose_findings
-from terrain.calibration.sensors import MIN_POSITION_S, accelerometer, gyro_bias, sensor_noise, standing
-from terrain.calibration.skid_steer import identify
+from terrain.calibration.sensors import (
+    LEVEL_ONLY,
+    MIN_POSITION_S,
+    NO_STANDING,
+    accelerometer,
+    gyro_bias,
+    mounting,
+    sensor_noise,
+    standing,
+    wheel_noise,
+)
 from terrain.calibration.wheels import (
     SLIP_RATIO,
     hard_stretches,
@@ -25,10 +35,11 @@ from terrain.calibration.wheels import (
 )
 from terrain.errors import DataError
 from terrain.records import RunLog
-from terrain.robots import OmniRobot, Robot, robot_from
+from terrain.robots import OmniRobot, Robot, SwerveRobot, robot_from
 from terrain.terramechanics.soil import load_soil, soil_names
 
 IDENTIFIED = "identified"  #: Section of a description that need not be there before.
+NO_IMU = "no run has an IMU (stream 'imu'), by which rest is known, and whose biases, noise and mounting rest shows"
 MAX_NAMED_RUNS = 4  #: A source names that many runs, and counts more.
 
 
@@ -51,33 +62,37 @@ def hard_grounds() -> tuple[str, ...]:
 
 
 def findings_of(runs: Sequence[RunLog], description: Any, robot: Robot, hard: Sequence[str]) -> list[Finding]:
-    """Return what the runs of a robot show, by its drive, beside what its description has.
+    """Return what the runs of a robot show, by whatever measured its motion, beside what its description has.
 
-    ``DataError`` if a run is another robot's, or those of a skid-steer robot have no lidar; ``ConfigError`` if the
-    description lacks a section.
+    What a stream would show that no run has is there without a value.  ``DataError`` if a run is another robot's;
+    ``ConfigError`` if the description of a swerve or omni robot lacks a section.
     """
-    if robot.skids and not any("lidar" in run.streams for run in runs):
-        raise DataError(
-            f"robot {robot.name}: drive {robot.drive!r} is not calibrated from logs without the stream "
-            "'lidar', speeds over ground, which those of DRIVE have"
-        )
     for run in runs:
         if run.robot != robot.name:
             raise DataError(
                 f"run {run.run_id} is one of robot {run.robot!r}, and {robot.name!r} is calibrated"
             )
-    if robot.skids:
-        findings = identify(runs, robot.wheel_radius_m, hard)
-    elif isinstance(robot, OmniRobot):
+    if isinstance(robot, SwerveRobot | OmniRobot):
         robot.require(*robot.sections)
-        findings = identify_omni(runs, robot)
-    elif kinematic_of(robot) and any("pose" in run.streams for run in runs):
-        findings = pose_findings(runs, robot)
+    resting = [stretch for run in runs for stretch in standing(run, robot)]
+    held = [stretch for run in runs for stretch in standing(run, robot, MIN_POSITION_S)]
+    findings = [*gyro_bias(resting, robot), *accelerometer(held, robot), *sensor_noise(resting, robot)]
+    value = {row.parameter: row.value for row in findings if row.determined}
+    biases = [value.get(f"sensors.accel_bias_{axis}_mps2", 0.0) for axis in "xyz"]
+    findings += [*mounting(runs, resting, robot, biases), *wheel_noise(runs, robot)]
+    if not any("imu" in run.streams for run in runs):
+        findings = [
+            row._replace(note=NO_IMU) if row.note in (NO_STANDING, LEVEL_ONLY) else row for row in findings
+        ]
+    if isinstance(robot, OmniRobot):
+        of_rollers = identify_omni(runs, robot)
+        shown = {row.parameter for row in of_rollers if row.determined}
+        findings += of_rollers
+        if RADIUS not in shown:
+            findings += [row for row in motion_findings(runs, robot, hard) if row.parameter not in shown]
     else:
-        robot.require(*robot.sections)
-        resting = [stretch for run in runs for stretch in standing(run, robot)]
-        held = [stretch for run in runs for stretch in standing(run, robot, MIN_POSITION_S)]
-        findings = [*gyro_bias(resting, robot), *accelerometer(held, robot), *sensor_noise(resting, robot)]
+        findings += [*motor_constant(runs, robot), *motion_findings(runs, robot, hard)]
+    if isinstance(robot, SwerveRobot):
         stretches, why = (
             [each for run in runs for each in hard_stretches(run, hard)],
             why_none(runs, robot, hard),
@@ -90,21 +105,31 @@ def findings_of(runs: Sequence[RunLog], description: Any, robot: Robot, hard: Se
         events = [each for stretch in stretches for each in starts_and_stops(stretch, better)]
         lags = time_constants(events)
         findings += lags if events else [finding._replace(note=why) for finding in lags]
+    best = dict[str, Finding]()
+    for finding in findings:  # of two about one number the one that has it
+        if finding.parameter not in best or finding.determined:
+            best[finding.parameter] = finding
+    findings = list(best.values())
     for i, finding in enumerate(findings):
         section, _, name = finding.parameter.partition(".")
         if entry := description.get(section, {}).get(name):
             findings[i] = finding._replace(unit=entry["unit"], described=float(entry["value"]))
         else:
-            findings[i] = finding._replace(unit=name.rpartition("_")[2] if section == IDENTIFIED else "s")
+            findings[i] = finding._replace(unit=name.rpartition("_")[2] if name else "s")
     return findings
 
 
 def described_with(description: Any, findings: Sequence[Finding]) -> Any:
     """Return a description with the numbers that were found, rounded to a hundredth of their intervals."""
     found = copy.deepcopy(description)
+    new = {
+        finding.parameter.partition(".")[2]
+        for finding in findings
+        if finding.determined and "antenna." in finding.parameter
+    }
     for finding in findings:
         section, _, name = finding.parameter.partition(".")
-        if section == IDENTIFIED and finding.determined:
+        if (section == IDENTIFIED or (section == "antenna" and len(new) == 2)) and finding.determined:
             unit = name.rpartition("_")[2]
             found.setdefault(section, {}).setdefault(name, {"unit": unit})
         if not finding.determined or name not in found.get(section, {}):

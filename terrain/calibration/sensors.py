@@ -19,10 +19,12 @@ Here it is the variance within batches of a second about a straight line.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.ndimage import median_filter
 
 from terrain.angles import unwrapped
@@ -32,7 +34,8 @@ from terrain.errors import DataError
 from terrain.estimation.feed import MIN_CONFIDENCE_RATIO
 from terrain.identify import Parameter, half_width, identify, std_interval
 from terrain.kinematics.camera import CHANNELS, body_motion
-from terrain.kinematics.wheels import point_velocity
+from terrain.kinematics.logged_wheels import with_wheel_speeds
+from terrain.kinematics.wheels import point_velocity, rolled_twist
 from terrain.logs.schema import IMU_CHANNELS, TWIST
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
@@ -77,24 +80,35 @@ class Stretch(NamedTuple):
 def standing(run: RunLog, robot: Robot, min_s: float = MIN_STANDING_S) -> list[Stretch]:
     """Return the stretches, of at least ``min_s``, in which nothing moves.
 
-    The wheels stand, where the log has any; the IMU is there, scatters about its noise, turns by no more
-    than a bias can, and is not frozen.  What is returned is short of the motion at either end by a block.
+    The wheels stand, where the log has any; the IMU is there, scatters about its noise (as described, or else as in
+    its quietest tenth), turns by no more than a bias can, and is not frozen.  What is returned is short of the motion
+    at either end by a block.
     """
-    motors, sensors = robot.motors, robot.sensors
-    imu = Stretch(run).of("imu", GYRO + ACCEL)
+    there = run.streams["imu"].channels if "imu" in run.streams else ()
+    channels = [name for name in GYRO + ACCEL if name in there]
+    imu = Stretch(run).of("imu", channels) if channels else None
     if imu is None:
         return []
     size = max(round(BLOCK_S * imu.rate_hz), 3)
     n = len(imu) // size
-    values, time_s = imu.values[: n * size].reshape(n, size, 6), imu.time_s[: n * size].reshape(n, size)
-    scatter = values.std(axis=1)
-    limit = QUIET_FACTOR * np.repeat([sensors.gyro_std_radps, sensors.accel_std_mps2], 3)
-    quiet = ((scatter > 0) & (scatter < limit)).all(axis=1) & (np.ptp(time_s, axis=1) < 1.5 * BLOCK_S)
-    quiet &= (np.abs(values[:, :, :3].mean(axis=1)) < MAX_BIAS_RADPS).all(axis=1)
-    wheels = Stretch(run).of("wheels", [f"motor_{wheel}_radps" for wheel in robot.wheels])
+    values, time_s = imu.values[: n * size].reshape(n, size, -1), imu.time_s[: n * size].reshape(n, size)
+    scatter, rates = values.std(axis=1), [name in GYRO for name in channels]
+    wheels = Stretch(run).of("wheels", robot.rate_channels)
+    if robot.describes("sensors"):
+        usual = np.where(rates, robot.sensors.gyro_std_radps, robot.sensors.accel_std_mps2)
+    elif wheels is None or not n:
+        return []
+    else:  # the quietest that the run has, where its wheels stand
+        usual = np.array(
+            [np.quantile(each[each > 0], 0.1) if (each > 0).any() else 0.0 for each in scatter.T]
+        )
+    quiet = ((scatter > 0) & (scatter < QUIET_FACTOR * usual)).all(axis=1) & (
+        np.ptp(time_s, axis=1) < 1.5 * BLOCK_S
+    )
+    quiet &= (np.abs(values[:, :, rates].mean(axis=1)) < MAX_BIAS_RADPS).all(axis=1)
     if wheels is not None:
-        wheel_speed_mps = np.abs(wheels.values).max(axis=1) / motors.reduction_ratio * robot.wheel_radius_m
-        moving_s = wheels.time_s[wheel_speed_mps > STANDING_MPS]
+        by_rate = robot.wheel_radius_m / robot.motors.reduction_ratio if robot.by_motor else 1.0
+        moving_s = wheels.time_s[np.abs(wheels.values).max(axis=1) * by_rate > STANDING_MPS]
         quiet &= np.searchsorted(moving_s, time_s[:, 0]) == np.searchsorted(moving_s, time_s[:, -1])
         quiet &= (time_s[:, 0] >= wheels.time_s[0]) & (time_s[:, -1] <= wheels.time_s[-1] + BLOCK_S)
     # Nearly a block at either end shares its block with a motion; one more is left away for what swings on.
@@ -120,18 +134,23 @@ def gyro_bias(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
     The error of a mean is that of the means over :data:`BATCH_S`: the colour of the noise, and a bias that
     walks, count as far as they show within a run.
     """
-    names = [f"sensors.gyro_bias_{axis}_radps" for axis in "xyz"]
+    there = [stretch.run.streams["imu"].channels for stretch in stretches]
+    axes = [
+        axis for axis, name in zip("xyz", GYRO, strict=True) if all(name in channels for channels in there)
+    ]
+    names = [f"sensors.gyro_bias_{axis}_radps" for axis in axes]
     n, means = 0, dict[str, list[Array]]()
     for stretch in stretches:
-        if stream := stretch.of("imu", GYRO):
+        if axes and (stream := stretch.of("imu", [f"gyro_{axis}_radps" for axis in axes])):
             n += len(stream)
             means.setdefault(stretch.run.run_id, []).extend(batch.mean(axis=0) for batch in batches(stream))
     if not n:
+        names = [f"sensors.gyro_bias_{axis}_radps" for axis in "xyz"]
         return undetermined([*names, "sensors.gyro_bias_std_radps"], NO_STANDING)
     parts = [np.array(part) for part in means.values()]
     found = np.array([part.mean(axis=0) for part in parts])
     variance = np.array([part.var(axis=0, ddof=1) / len(part) for part in parts])
-    described = robot.sensors.gyro_bias_std_radps
+    described = robot.sensors.gyro_bias_std_radps if robot.describes("sensors") else 0.0
     return biases(names, found, variance, described, n, "samples", tuple(means))
 
 
@@ -149,19 +168,22 @@ def biases(
 ) -> list[Finding]:
     """Predict the biases of future power-ons, and their scatter, from those of single power-ons.
 
-    Found are (k, 3) biases in each power-on, each run one, with the variances of their errors; the described scatter is
-    taken for true where there is one alone.  However well a bias is known in one power-on, the scatter limits how well
-    it predicts the next one.  The axes share one scatter, as the description has it: k power-ons give 3 (k - 1)
-    degrees of freedom.
+    Found are (k, axes) biases in each power-on, each run one, with the variances of their errors; the described scatter
+    is taken for true where there is one alone, and the interval is of that power-on where none is described.  However
+    well a bias is known in one power-on, the scatter limits how well it predicts the next one.  The axes share one
+    scatter, as the description has it: k power-ons give k - 1 degrees of freedom an axis.
     """
-    k, mean, dof = len(found), found.mean(axis=0), 3 * (len(found) - 1)
-    std_name, note = names[0].replace("_x_", "_std_"), "each run is taken for a power-on"
+    (k, n_axes), mean = found.shape, found.mean(axis=0)
+    dof, note = n_axes * (k - 1), "each run is taken for a power-on"
+    std_name = re.sub("_[xyz]_", "_std_", names[0])
     if k == 1:
         note = f"one power-on: the next differs by {described_std:g}, as described"
+        if not described_std > 0.0:
+            note = "of this power-on: how much the next differs, one run does not show"
         between, half = math.nan, half_width(np.sqrt(variance[0] + described_std**2), math.inf)
     else:
         between = float(((found - mean) ** 2).sum() / dof)
-        half = np.broadcast_to(half_width(math.sqrt(between / k), dof), 3)
+        half = np.broadcast_to(half_width(math.sqrt(between / k), dof), n_axes)
     each = [around(*row, n, counted, runs, note) for row in zip(names, mean, half, strict=True)]
     if k < MIN_POWER_ONS:
         return each + undetermined(
@@ -291,7 +313,7 @@ def accelerometer(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
     n = sum(len(of_run[run_id]) for run_id in runs)
     bias, scale, cov = (np.array(part) for part in zip(*fits.values(), strict=True))
     variance = np.diagonal(cov, axis1=1, axis2=2)
-    described = robot.sensors.accel_bias_std_mps2
+    described = robot.sensors.accel_bias_std_mps2 if robot.describes("sensors") else 0.0
     half = half_width(np.sqrt(variance[:, 3:].mean(axis=0) / len(runs)), math.inf)
     scales = zip(scale_names, scale.mean(axis=0), half, strict=True)
     return [
@@ -319,6 +341,7 @@ NOISE: Mapping[str, tuple[str, Sequence[str]]] = {
     "camera.speed_std_mps": ("", SEEN[:2]),
     "camera.yaw_rate_std_radps": ("", SEEN[2:3]),
     "camera.yaw_std_rad": ("", SEEN[3:]),
+    "identified.gnss_std_m": ("gnss", ("position_x_m", "position_y_m")),
 }
 
 
@@ -332,15 +355,19 @@ def sensor_noise(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
     description has the steps by themselves.
     """
     if not stretches:
-        return undetermined(list(NOISE), NO_STANDING)
+        return undetermined([name for name in NOISE if robot.describes(name.partition(".")[0])], NO_STANDING)
     seen, found = [seen_motion(stretch, robot) for stretch in stretches], []
     for parameter, (stream, names) in NOISE.items():
         channels = [
             name.format(wheel) for name in names for wheel in (robot.wheels if "{" in name else ("",))
         ]
         n, runs, left = 0, [], []
+        logged = [set(each.run.streams[stream].channels) for each in stretches if stream in each.run.streams]
+        channels = [name for name in channels if all(name in has for has in logged)] if logged else channels
+        if not (logged and channels) and stream and not robot.describes(parameter.partition(".")[0]):
+            continue
         for stretch, by_camera in zip(stretches, seen, strict=True):
-            signal = stretch.of(stream, channels)
+            signal = stretch.of(stream, channels) if channels else None
             if not stream and by_camera is not None:
                 columns = by_camera.columns(channels)
                 signal = Stream(by_camera.time_s, columns, tuple(channels))
@@ -360,11 +387,11 @@ def sensor_noise(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
 def _noise(parameter: str, residuals: Sequence[Array], n: int, runs: Sequence[str], robot: Robot) -> Finding:
     """Return the finding of one number by the residuals of batches about straight lines."""
     section, _, name = parameter.partition(".")
-    described = getattr(getattr(robot, section), name)
+    described = getattr(getattr(robot, section), name) if robot.describes(section) else 0.0
     if not residuals:
         return undetermined([parameter], "no standing stretch has this signal")[0]
     squares = float(sum((part**2).sum() for part in residuals))
-    if squares < sum(part.size for part in residuals) * (NO_NOISE_SHARE * described) ** 2:
+    if squares <= sum(part.size for part in residuals) * (NO_NOISE_SHARE * described) ** 2:
         return undetermined([parameter], "no noise at rest")[0]
     together = [
         sum(float((part[lag:] * part[:-lag]).sum()) for part in residuals if len(part) > lag)
@@ -377,13 +404,159 @@ def _noise(parameter: str, residuals: Sequence[Array], n: int, runs: Sequence[st
     variance = squares / dof
     low, high = std_interval(variance, dof / (1 + 2 * (correlation**2).sum()))
     step_variance = 0.0
-    if parameter == "sensors.steering_std_rad":
+    if parameter == "sensors.steering_std_rad" and robot.describes("sensors"):
         step = 2 * math.pi / robot.sensors.steering_steps_ratio
         step_variance = step**2 / 12
         if variance - step_variance < (MIN_NOISE_STEPS * step) ** 2:
             return undetermined([parameter], f"the noise hides below the encoder's step of {step:.2g} rad")[0]
     value, low, high = (math.sqrt(max(x - step_variance, 0.0)) for x in (variance, low**2, high**2))
     return Finding(parameter, value, low, high, n, "samples", tuple(dict.fromkeys(runs)))
+
+
+MOUNTING = tuple(f"identified.imu_{name}_rad" for name in ("roll", "pitch", "yaw"))
+SPAN_S = 0.5  #: Over which a change of speed is compared with the integral of the acceleration.
+MIN_SPEED_CHANGE_MPS = 0.05  #: Over that; less is noise.
+MAX_TURNED_RAD = 0.1  #: Interval of a yaw from which on it is not stated.
+SLOPE = "over runs, as the slope under one and the bias of the accelerometer look alike"
+
+
+def mounting(
+    runs: Sequence[RunLog],
+    rests: Sequence[Stretch],
+    robot: Robot,
+    bias_mps2: Sequence[float] = (0.0, 0.0, 0.0),
+) -> list[Finding]:
+    """Return roll, pitch and yaw by which the IMU is turned in the body; its accelerometer's biases are taken off.
+
+    Notes
+    -----
+    Gravity at rest on a level floor is ``(-sin pitch, sin roll cos pitch, cos roll cos pitch) g`` in the axes of the
+    IMU.  Over :data:`SPAN_S` the integrals of both horizontal axes are the changes of speed ``dv`` ahead and ``v w dt``
+    to the left, by the wheels and the gyro, turned by the yaw; each has a gain of its own, as a body that pitches or
+    rolls adds gravity in proportion.  Robots that drive sideways have no direction ahead that the wheels alone show.
+    """
+    with_accel = [
+        run for run in runs if "imu" in run.streams and set(ACCEL) <= set(run.streams["imu"].channels)
+    ]
+    if not with_accel:
+        return undetermined(MOUNTING, "no run has an accelerometer (stream 'imu', channels 'accel_*_mps2')")
+    of_run: dict[str, list[Array]] = {}
+    for stretch in rests:
+        if stream := stretch.of("imu", ACCEL):
+            of_run.setdefault(stretch.run.run_id, []).append(stream.values.mean(axis=0))
+    found = undetermined(MOUNTING[:2], NO_STANDING)
+    if of_run:
+        x, y, z = (np.array([np.mean(means, axis=0) for means in of_run.values()]) - bias_mps2).T
+        angles = np.column_stack([np.arctan2(y, z), np.arctan2(-x, np.hypot(y, z))])
+        found = undetermined(MOUNTING[:2], f"{len(angles)} runs at rest: {MIN_POWER_ONS} are needed {SLOPE}")
+        if len(angles) >= MIN_POWER_ONS:
+            half = half_width(angles.std(axis=0, ddof=1) / math.sqrt(len(angles)), len(angles) - 1)
+            rows = zip(MOUNTING, angles.mean(axis=0), half, strict=False)
+            found = [around(*row, len(angles), "runs", of_run, SLOPE) for row in rows]
+    changes = [part for run in with_accel if (part := _speed_changes(run, robot)) is not None]
+    nothing = undetermined(MOUNTING[2:], "too few starts and stops beside wheel speeds show where ahead is")
+    if robot.sideways or sum(map(len, changes)) < 2 * MIN_DRIVEN:
+        return [*found, *nothing]
+    number = np.repeat(np.arange(len(changes)), [len(part) for part in changes])
+    if len(changes) < MIN_POWER_ONS:  # blocks of time
+        number = np.concatenate([np.arange(len(part)) // MIN_DRIVEN for part in changes])
+        number += np.repeat(100_000 * np.arange(len(changes)), [len(part) for part in changes])
+        number = np.unique(number, return_inverse=True)[1]
+    ahead, left, x, y = np.concatenate(changes).T
+
+    def residual(p: Array) -> Array:
+        by_x, by_y = p[0] * ahead, p[1] * left
+        turned_x, turned_y = (
+            by_x * np.cos(p[2]) + by_y * np.sin(p[2]),
+            by_y * np.cos(p[2]) - by_x * np.sin(p[2]),
+        )
+        return np.column_stack([x - turned_x - p[3], y - turned_y - p[4]])
+
+    gains = [Parameter(f"gain_{axis}", 1.0, 0.2, 5.0, step=0.1) for axis in "xy"]
+    offsets = [Parameter(f"offset_{axis}_mps", 0.0, step=0.05) for axis in "xy"]
+    turned = Parameter("yaw_rad", 0.0, -4.0, 4.0, step=0.1)
+    starts = [np.array([1.0, 1.0, at, 0.0, 0.0]) for at in (0.0, math.pi / 2, -math.pi / 2, math.pi)]
+    fit = identify(residual, [*gains, turned, *offsets], number, True, starts, scale=(0.1, 1e-3))
+    yaw, apart = float(fit.value[2]), float(half_width(fit.std[2], len(fit.influence) - 1))
+    if not apart < MAX_TURNED_RAD / 2:
+        return [*found, *nothing]
+    ids = [run.run_id for run in with_accel]
+    return [
+        *found,
+        around(MOUNTING[2], yaw, apart, len(x), "changes of speed", ids, "by accelerations along the motion"),
+    ]
+
+
+MIN_DRIVEN = 20  #: Changes of speed of a cluster, and half of those at the least.
+
+
+def _speed_changes(run: RunLog, robot: Robot) -> Array | None:
+    """Return changes of speed ahead and to the left by wheels and gyro, and integrals of both accelerations (n, 4)."""
+    driven, imu = with_rolled(run, robot), Stretch(run).of("imu", ("gyro_z_radps", *ACCEL[:2]))
+    if driven is None or imu is None:
+        return None
+    time_s, twist = driven
+    edges_s = np.arange(max(time_s[0], imu.time_s[0]), min(time_s[-1], imu.time_s[-1]), SPAN_S)
+    if len(edges_s) < 3:
+        return None
+    gained = cumulative_trapezoid(imu.values, imu.time_s, axis=0, initial=0.0)
+    yaw, x, y = np.diff([np.interp(edges_s, imu.time_s, column) for column in gained.T])
+    speed = np.interp(edges_s, time_s, twist[:, 0])
+    ahead, left = np.diff(speed), 0.5 * (speed[1:] + speed[:-1]) * yaw
+    moves = np.hypot(ahead, left) >= MIN_SPEED_CHANGE_MPS
+    return np.column_stack([ahead, left, x, y])[moves] if moves.any() else None
+
+
+def with_rolled(run: RunLog, robot: Robot) -> tuple[Array, Array] | None:
+    """Return stamps (n,) and the twist (n, 3) that the wheels would roll without slip; None without their speeds."""
+    run = with_wheel_speeds(run, robot) if robot.by_motor and robot.describes("motors") else run
+    speeds = Stretch(run).of("wheels", [f"speed_{wheel}_mps" for wheel in robot.logged_wheels])
+    if speeds is None:
+        return None
+    steer = np.zeros((len(speeds), len(robot.wheels)))
+    if robot.steered:
+        angles = Stretch(run).of("steering", robot.steer_channels)
+        if angles is None:
+            return None
+        for i, column in enumerate(angles.values.T):
+            steer[:, i] = (
+                np.interp(speeds.time_s, angles.time_s, unwrapped(column)) - robot.steering_zeros_rad[i]
+            )
+    return speeds.time_s, rolled_twist(robot, speeds.values, steer)
+
+
+WHEEL_NOISE = "identified.wheel_speed_std_mps"
+
+
+def wheel_noise(runs: Sequence[RunLog], robot: Robot) -> list[Finding]:
+    """Return the noise of wheel speeds in motion, by their second differences, of which the median counts.
+
+    Of white noise they have six times its variance; a speed that changes evenly has none.  Values that repeat are
+    one measurement held.
+    """
+    if robot.by_motor:
+        return []
+    stds, ids = [], []
+    for run in runs:
+        stream = Stretch(run).of("wheels", robot.rate_channels)
+        values = np.empty((0, 1)) if stream is None else stream.values
+        parts = [column[np.flatnonzero(np.diff(column, prepend=np.nan))] for column in values.T]
+        second = (
+            np.concatenate([np.diff(part[np.abs(part) > STANDING_MPS], 2) for part in parts])
+            if parts
+            else values
+        )
+        if len(second) >= MIN_DRIVEN:
+            stds.append(float(np.median(np.abs(second)) / 0.6745 / math.sqrt(6.0)))
+            ids.append(run.run_id)
+    if len(stds) < MIN_POWER_ONS:
+        return undetermined(
+            [WHEEL_NOISE], f"{len(stds)} runs drive: {MIN_POWER_ONS} at least show how noise differs"
+        )
+    half = float(half_width(float(np.std(stds, ddof=1)) / math.sqrt(len(stds)), len(stds) - 1))
+    if not np.mean(stds) > half:
+        return undetermined([WHEEL_NOISE], "the noise hides below the steps of the wheel speeds")
+    return [around(WHEEL_NOISE, float(np.mean(stds)), half, len(stds), "runs", ids, "of a sample, in motion")]
 
 
 def measurement_variances(robot: Robot, floor: float = NOISE_FLOOR) -> dict[str, float]:

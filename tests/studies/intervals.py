@@ -5,12 +5,13 @@ A use draws data with numbers that it hides, identifies them, and looks whether 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.stats import truncnorm
 
 from pipelines.report.results import Progress, Result, described, silent
@@ -19,17 +20,19 @@ from pipelines.report.settings import setting
 from pipelines.report.tree import Column, Report, Table
 from terrain.bootstrap import proportion_interval
 from terrain.calibration.description import findings_of
+from terrain.calibration.finding import Finding
 from terrain.calibration.lag import STAMP_S
+from terrain.calibration.motion import SLIP_RATIO as RADIUS_SLIP_RATIO
+from terrain.calibration.motion import motion_findings
 from terrain.calibration.odometry import SLIP, fit_odometry, legs_of_poses, level
 from terrain.calibration.sensors import fit_gravity
-from terrain.calibration.skid_steer import SLIP_RATIO as RADIUS_SLIP_RATIO
-from terrain.calibration.skid_steer import identify as identify_skid
 from terrain.calibration.wheels import SLIP_RATIO
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.files.documents import read_yaml
 from terrain.identify import Parameter, half_width, identify
 from terrain.kinematics.wheels import rolling_matrix
+from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
 from terrain.records import Array, Label, RunLog, Stream, TargetStatus
 from terrain.robots import description_file, load_robot
 from terrain.simulation.plants.tracks import PrescribedSlip
@@ -156,6 +159,104 @@ def skid_run(radius_m, track_m, lidar_s, wheels_s, seed, terrain="asphalt", slip
     return RunLog(f"run_{seed:03d}", "warthog", streams, labels, session=session)
 
 
+RTK_STEP_S = 0.005
+RTK_TRUTH = {
+    "rolling_radius_m": 0.171,
+    "effective_track_m": 0.95,
+    "wheels_delay_s": 0.06,
+    "gnss_delay_s": 0.13,
+    "lever_x_m": 0.22,
+    "lever_y_m": -0.1,
+}
+
+
+def rtk_run(
+    seed,
+    n_turns=18,
+    terrain="asphalt",
+    slip=0.01,
+    turning=0.8,
+    bias_radps=None,
+    noise=1.0,
+    rest_s=8.0,
+    track_m=RTK_TRUTH["effective_track_m"],
+    narrowing=0.0,
+    mount_rad=(0.0, 0.0, 0.0),
+    ampere_per_n=None,
+):
+    """A run that stands and then drives random speeds and turns; wheels 20 Hz, IMU 100, receiver 10."""
+    rng = np.random.default_rng(seed)
+    lengths = rng.integers(400, 900, n_turns)
+    v, w = (
+        np.repeat(values, lengths)
+        for values in (rng.uniform(-0.6, 1.0, n_turns), rng.uniform(-1, 1, n_turns))
+    )
+    w = w * turning
+    kernel = np.exp(-np.arange(400) / 60.0)
+    n_rest = round(rest_s / RTK_STEP_S)
+    v, w = (
+        np.concatenate([np.zeros(n_rest), np.convolve(each, kernel / kernel.sum())[: len(each)]])
+        for each in (v, w)
+    )
+    t = RTK_STEP_S * np.arange(len(v))
+    yaw = rng.uniform(-np.pi, np.pi) + cumulative_trapezoid(w, dx=RTK_STEP_S, initial=0.0)
+    place = cumulative_trapezoid(v * np.exp(1j * yaw), dx=RTK_STEP_S, initial=0.0) + 1000.0 * rng.normal()
+    place = place + np.exp(1j * yaw) * complex(RTK_TRUTH["lever_x_m"], RTK_TRUTH["lever_y_m"])
+    bias = rng.normal(0.0, 0.003) if bias_radps is None else bias_radps
+
+    def at(signal, at_s, late_s):
+        return np.interp(at_s - late_s, t, signal)
+
+    wheels_s, imu_s, gnss_s = (
+        np.arange(first, t[-1], step) for first, step in ((0.003, 0.05), (0.0, 0.01), (0.02, 0.1))
+    )
+    rolled = v / (1.0 - slip) * 0.165 / RTK_TRUTH["rolling_radius_m"]
+    across = w * track_m / 2
+    for _ in range(
+        20
+    ):  # a tighter turn has another track: by the difference of the sides over the sum of their sizes
+        sharp = np.abs(across) / np.maximum(np.maximum(np.abs(across), np.abs(rolled)), 1e-9)
+        across = w * track_m / 2 * (1.0 + narrowing * (sharp - 0.5))
+    sides = [at(rolled + sign * across, wheels_s, RTK_TRUTH["wheels_delay_s"]) for sign in (-1, 1)]
+    wheels = np.column_stack(sides)
+    wheels += noise * rng.normal(0.0, 0.005, wheels.shape) * (np.abs(wheels) > 1e-9)
+    accel = np.gradient(v, RTK_STEP_S)
+    force = np.column_stack([accel, v * w, np.full(len(v), 9.80665)])
+    roll, pitch, turned = mount_rad
+    cos, sin = np.cos, np.sin
+    by_yaw = np.array([[cos(turned), sin(turned), 0], [-sin(turned), cos(turned), 0], [0, 0, 1]])
+    by_pitch = np.array([[cos(pitch), 0, -sin(pitch)], [0, 1, 0], [sin(pitch), 0, cos(pitch)]])
+    by_roll = np.array([[1, 0, 0], [0, cos(roll), sin(roll)], [0, -sin(roll), cos(roll)]])
+    force = force @ (by_roll @ by_pitch @ by_yaw).T
+    imu = [at(w, imu_s, 0.0) + bias, *(at(each, imu_s, 0.0) for each in force.T)]
+    imu = [
+        values + noise * rng.normal(0.0, std, len(imu_s))
+        for values, std in zip(imu, (0.004, 0.05, 0.05, 0.05), strict=True)
+    ]
+    seen = (
+        at(place.real, gnss_s, RTK_TRUTH["gnss_delay_s"]),
+        at(place.imag, gnss_s, RTK_TRUTH["gnss_delay_s"]),
+    )
+    gnss = [each + noise * rng.normal(0.0, 0.015, len(gnss_s)) for each in seen]
+    east, north = (np.gradient(each, 0.1) for each in gnss)
+    fixes = np.column_stack([*gnss, east, north, np.full(len(gnss_s), 0.015), np.ones(len(gnss_s))])
+    sides_n = 60.0 * accel / 2.0 + 15.0 * np.tanh(v / 0.02)
+    currents = (
+        []
+        if ampere_per_n is None
+        else [at(ampere_per_n * sides_n, wheels_s, RTK_TRUTH["wheels_delay_s"])] * 2
+    )
+    names = ("speed_left_mps", "speed_right_mps", *("current_left_a", "current_right_a")[: len(currents)])
+    values = np.column_stack([wheels, *(each + rng.normal(0.0, 0.1, len(wheels_s)) for each in currents)])
+    streams = {
+        "wheels": Stream(wheels_s, values, names),
+        "imu": Stream(imu_s, np.column_stack(imu), ("gyro_z_radps", *IMU_CHANNELS[3:6])),
+        "gnss": Stream(gnss_s, fixes, GNSS_CHANNELS),
+    }
+    labels = (Label(0.0, float(t[-1]), terrain),) if terrain else ()
+    return RunLog(f"run_{seed:03d}", "husky", streams, labels), bias
+
+
 def drawn_runs(
     law, theta, rng, n=6, noise=0.01, run_std=0.1, offset_std=0.003, reach=0.6, offset=0.0, tilt=0.0
 ):
@@ -250,7 +351,7 @@ def _swerve(seed: int) -> Iterator[Interval]:
         runs[k] = replace(run, streams={**run.streams, "imu": imu})
     for finding in findings_of(runs, description, NOMINAL, ("tiles",)):
         section, _, name = finding.parameter.partition(".")
-        if finding.determined and name:
+        if finding.determined and name and section != "identified":
             yield Interval(name, finding.low, finding.high, getattr(getattr(HIDDEN, section), name))
 
 
@@ -259,9 +360,25 @@ def _skid_steer(seed: int) -> Iterator[Interval]:
     rng = np.random.default_rng(seed)
     lidar_s, wheels_s = np.array([0.3, 0.05]) + rng.uniform(0.0, 0.05, 2)
     slip, hidden = rng.uniform(*RADIUS_SLIP_RATIO), (0.29, 1.8, lidar_s, wheels_s)
-    runs = [skid_run(*hidden, 1000 * seed + k, slip=slip, n_steps=4) for k in range(8)]
-    for finding, truth in zip(identify_skid(runs, NOMINAL_M, ("asphalt",)), hidden, strict=True):
-        yield Interval(finding.parameter.partition(".")[2], finding.low, finding.high, truth)
+    runs = [skid_run(*hidden, 1000 * seed + k, slip=slip) for k in range(8)]
+    names = ("rolling_radius_m", "effective_track_m", "lidar_delay_s", "wheels_delay_s")
+    yield from _within(
+        motion_findings(runs, load_robot("warthog"), ("asphalt",)), dict(zip(names, hidden, strict=True))
+    )
+
+
+def _within(findings: Sequence[Finding], truth: Mapping[str, float]) -> Iterator[Interval]:
+    for finding in findings:
+        if finding.determined and (name := finding.parameter.partition(".")[2]) in truth:
+            yield Interval(name, finding.low, finding.high, truth[name])
+
+
+def _rtk(seed: int) -> Iterator[Interval]:
+    """A skid-steer robot of four numbers whose motion a receiver alone measures."""
+    slip = np.random.default_rng(seed).uniform(*RADIUS_SLIP_RATIO)
+    runs = [rtk_run(1000 * seed + k, slip=slip)[0] for k in range(8)]
+    robot = load_robot("husky").without("body", "motors", "camera", "sensors")
+    yield from _within(motion_findings(runs, robot, ("asphalt",)), RTK_TRUTH)
 
 
 def _soil(seed: int) -> Iterator[Interval]:
@@ -357,6 +474,7 @@ USES: dict[str, tuple[Callable[[int], Iterator[Interval]], float]] = {
     "six-positions": (_six_positions, 0.95),
     "swerve": (_swerve, 0.95),
     "skid-steer": (_skid_steer, 0.95),
+    "rtk": (_rtk, 0.95),
     "rollers": (_rollers, 0.95),
     "odometry": (_odometry, 0.95),
     "soil": (_soil, 0.95),
