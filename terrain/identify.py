@@ -13,8 +13,7 @@ belong together (Liang and Zeger, Biometrika 73, 1986), that of the jackknife to
 what leaving out each cluster moves the values by (CR3 of Bell and McCaffrey, Survey Methodology 28, 2002: with a dozen
 clusters the plain sandwich is too narrow, as a fit goes after the clusters that weigh most),
 whose intervals are those of Student's t with G - 1 degrees of freedom.  Where a fit is not linear in what
-clusters differ by, :func:`jackknife` leaves each out in turn and :mod:`terrain.bootstrap` draws them with
-replacement.
+clusters differ by, :mod:`terrain.bootstrap` draws them with replacement.
 """
 
 from __future__ import annotations
@@ -257,24 +256,6 @@ def std_interval(variance: float, dof: float, level: float = LEVEL) -> tuple[flo
     """
     low, high = stats.chi2.ppf([(1 - level) / 2, (1 + level) / 2], dof)
     return math.sqrt(variance * dof / high), math.sqrt(variance * dof / low)
-
-
-def jackknife(estimate: Callable[[Array], float], n: int) -> float:
-    """Return the standard deviation of an estimate by leaving out each of n clusters in turn.
-
-    Parameters
-    ----------
-    estimate : of the clusters whose numbers (n - 1,) it gets
-    n : clusters; the deviation has n - 1 degrees of freedom
-
-    Examples
-    --------
-    >>> values = np.array([1.0, 2.0, 3.0, 6.0])
-    >>> bool(np.isclose(jackknife(lambda some: values[some].mean(), 4), values.std(ddof=1) / 2))
-    True
-    """
-    left_out = np.array([estimate(np.delete(np.arange(n), i)) for i in range(n)])
-    return math.sqrt((n - 1) / n * float(((left_out - left_out.mean()) ** 2).sum()))
 
 
 def folds(fold: Array) -> Iterator[tuple[Array, Array]]:

@@ -974,7 +974,7 @@ def robot_from(file: str, described: Any) -> Robot:
             entries |= {f"{section}.{key}": entry for key, entry in described[section].items()}
     assumed = frozenset(k for k, e in entries.items() if e["source"].strip().lower().startswith("assumed"))
     shown_by_logs, filters = described.get("identified", {}), described.get("filters", [])
-    # an effective track is one of a ground, or of a kind of turn: ``effective_track_grass_m``, ``effective_track_tight_m``
+    # an effective track is one of a ground, ``effective_track_grass_m``, or of a kind of turns, ``..._tight_m``
     of_ground = [
         key for key in shown_by_logs if f"{key}".startswith("effective_track_") and f"{key}".endswith("_m")
     ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import yaml
@@ -36,6 +37,7 @@ from terrain.calibration.wheels import (
 from terrain.errors import DataError
 from terrain.records import RunLog
 from terrain.robots import OmniRobot, Robot, SwerveRobot, robot_from
+from terrain.simulation.assumed import with_assumed
 from terrain.terramechanics.soil import load_soil, soil_names
 
 IDENTIFIED = "identified"  #: Section of a description that need not be there before.
@@ -91,7 +93,7 @@ def findings_of(runs: Sequence[RunLog], description: Any, robot: Robot, hard: Se
         if RADIUS not in shown:
             findings += [row for row in motion_findings(runs, robot, hard) if row.parameter not in shown]
     else:
-        findings += [*motor_constant(runs, robot), *motion_findings(runs, robot, hard)]
+        findings = [*motion_findings(runs, robot, hard), *motor_constant(runs, robot), *findings]
     if isinstance(robot, SwerveRobot):
         stretches, why = (
             [each for run in runs for each in hard_stretches(run, hard)],
@@ -122,14 +124,18 @@ def findings_of(runs: Sequence[RunLog], description: Any, robot: Robot, hard: Se
 def described_with(description: Any, findings: Sequence[Finding]) -> Any:
     """Return a description with the numbers that were found, rounded to a hundredth of their intervals."""
     found = copy.deepcopy(description)
-    new = {
-        finding.parameter.partition(".")[2]
-        for finding in findings
-        if finding.determined and "antenna." in finding.parameter
-    }
+    shown = {finding.parameter for finding in findings if finding.determined}
+    if "sensors" not in found and any(name.startswith("sensors.") for name in shown):
+        # a section is whole: what these runs do not show is what a simulation assumes
+        robot = with_assumed(robot_from(found["name"], description))
+        found["sensors"] = {
+            key: {"value": value, "unit": key.rpartition("_")[2], "source": "assumed: as a simulation has it"}
+            for key, value in asdict(robot.sensors).items()
+        }
+    both = {f"antenna.lever_{axis}_m" for axis in "xy"} <= shown
     for finding in findings:
         section, _, name = finding.parameter.partition(".")
-        if (section == IDENTIFIED or (section == "antenna" and len(new) == 2)) and finding.determined:
+        if (section == IDENTIFIED or (section == "antenna" and both)) and finding.determined:
             unit = name.rpartition("_")[2]
             found.setdefault(section, {}).setdefault(name, {"unit": unit})
         if not finding.determined or name not in found.get(section, {}):

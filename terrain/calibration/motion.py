@@ -27,8 +27,8 @@ leaving each out (:mod:`terrain.identify`).  Blocks hold other parts of the same
 tracks always slip, the interval contains what is assumed of it.  The centre about which such a robot turns and the
 place of a sensor ahead of it are one number.  Of a car the gain of the steering and the wheelbase are one, the
 effective wheelbase; a wheel that drives and is steered shows both.  Slip by traction, which over a second looks like a
-delay, is fitted beside it.  An effective track goes with the described radius (Mandow et al., Experimental kinematics for
-wheeled skid-steer mobile robots, IROS 2007), and is one of the ground and of the turns driven.
+delay, is fitted beside it.  An effective track goes with the described radius (Mandow et al., Experimental kinematics
+for wheeled skid-steer mobile robots, IROS 2007), and is one of the ground and of the turns driven.
 """
 
 from __future__ import annotations

@@ -325,6 +325,7 @@ def accelerometer(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
 NO_NOISE_SHARE = 0.01  #: Of the described standard deviation: a channel with less shows no noise at rest.
 #: Noise under this share of an encoder's step hides in the step; above, step^2/12 taken off is right (Sheppard).
 MIN_NOISE_STEPS = 0.4
+FIXED_RATIO = 0.5  #: Of a stretch whose fixes have less, the noise is that of another solution.
 LAGS = 10  #: Lags over which noise is looked at for colour.
 #: Least variance of a measurement, in its squared natural unit: no filter shall take a sensor for perfect (4.4.3).
 NOISE_FLOOR = 1e-5
@@ -368,6 +369,9 @@ def sensor_noise(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
             continue
         for stretch, by_camera in zip(stretches, seen, strict=True):
             signal = stretch.of(stream, channels) if channels else None
+            if stream == "gnss" and (fixed := stretch.of("gnss", (*channels, "fix_ratio"))) is not None:
+                signal = Stream(fixed.time_s, fixed.values[:, :-1], tuple(channels))
+                signal = signal if fixed.values[:, -1].min() >= FIXED_RATIO else None
             if not stream and by_camera is not None:
                 columns = by_camera.columns(channels)
                 signal = Stream(by_camera.time_s, columns, tuple(channels))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from studies import intervals
 
-from terrain.identify import Parameter, deal, folds, identify, jackknife, select
+from terrain.identify import Parameter, deal, folds, identify, select
 
 
 def line(x, y, first, second, **options):
@@ -84,9 +84,20 @@ def test_the_jackknife_of_a_slope_is_about_its_scatter():
     for _ in range(100):
         x = rng.normal(size=20)
         y = x + rng.normal(size=20)
-        stds.append(jackknife(lambda some, x=x, y=y: float(x[some] @ y[some] / (x[some] @ x[some])), 20))
+        fit = identify(lambda p, x=x, y=y: p[0] * x - y, [Parameter("slope_ratio", 1.0)], np.arange(20))
+        stds.append(fit.std[0])
         slopes.append(x @ y / (x @ x))
     assert np.mean(stds) == pytest.approx(np.std(slopes), rel=0.2)
+
+
+def test_a_prior_that_clusters_do_not_narrow_identifies_nothing():
+    known = Parameter("unseen_m", 0.0, prior_std=1.0)
+    fit = identify(
+        lambda p: p[0] + 1e-9 * p[1] - np.sin(np.arange(40.0)),
+        [Parameter("seen_m", 0.0), known],
+        np.arange(40) // 4,
+    )
+    assert fit.identified.tolist() == [True, False]
 
 
 def test_intervals_contain_what_is_hidden_as_often_as_they_state():

@@ -14,6 +14,8 @@ from terrain.calibration.motion import (
     motion_findings,
     parameters_of,
 )
+from terrain.calibration.motors import motor_constant
+from terrain.calibration.sensors import mounting, standing
 from terrain.errors import DataError
 from terrain.logs.schema import GNSS_CHANNELS
 from terrain.records import RunLog, Stream
@@ -331,7 +333,7 @@ def test_a_gyro_without_rest_has_its_bias_by_the_receiver():
     assert found.low < 0.01 + 0.002 * np.sin(np.arange(5)).mean() < found.high
 
 
-def test_tight_turns_are_told_from_wide_ones():
+def test_tight_turns_have_a_track_of_their_own():
     track_m = RTK_TRUTH["effective_track_m"]
     found = by_name(motion_findings(rtk_runs(6, seed=3, narrowing=0.3), HUSKY, ("asphalt",)))
     for name, factor in (("wide", 1.0 - 0.2 * 0.3), ("tight", 1.0 + 0.5 * 0.3)):
@@ -404,6 +406,36 @@ def test_noise_of_outliers_moves_little():
     for name in ("rolling_radius_m", "effective_track_m", "gnss_delay_s"):
         width = plain[name].high - plain[name].low
         assert abs(plain[name].value - jumping[name].value) < 1.5 * width, name
+
+
+def test_the_mounting_of_an_imu_comes_back():
+    mount = (0.03, -0.05, 0.2)
+    runs = rtk_runs(6, mount_rad=mount)
+    rests = [stretch for run in runs for stretch in standing(run, HUSKY)]
+    assert len(rests) == 6
+    for finding, truth in zip(mounting(runs, rests, HUSKY), mount, strict=True):
+        assert abs(finding.value - truth) < 1.5 * (finding.high - finding.low) / 2 + 1e-4, finding
+        assert finding.high - finding.low < 0.03
+    assert not any(row.determined for row in mounting(rtk_runs(2, turning=0.0), [], HUSKY)[:2])
+
+
+def test_torque_of_an_ampere_comes_back_and_currents_without_sign_say_so():
+    """60 kg and all that turns, on 30 N; the description has 57 kg."""
+    robot, radius_m = replace(HUSKY, mass_kg=57.0), HUSKY.wheel_radius_m
+    runs = rtk_runs(6, ampere_per_n=radius_m / 3.0, n_turns=30, turning=0.05)
+    found = by_name(motor_constant(runs, robot))
+    for name, truth in (("torque_per_current_nmpa", 3.0), ("resistance_n", 30.0)):
+        assert found[name].low < truth < found[name].high, found[name]
+        assert found[name].high - found[name].low < 0.3 * truth
+    unsigned = []
+    for run in runs:
+        s = run.streams["wheels"]
+        wheels = Stream(s.time_s, np.column_stack([s.values[:, :2], np.abs(s.values[:, 2:])]), s.channels)
+        unsigned.append(replace(run, streams=run.streams | {"wheels": wheels}))
+    assert "no sign" in motor_constant(unsigned, robot)[0].note
+    assert (
+        "no run has currents (current_left_a, current_right_a)" in motor_constant(rtk_runs(1), robot)[0].note
+    )
 
 
 @pytest.mark.slow
