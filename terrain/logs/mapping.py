@@ -67,6 +67,16 @@ MAX_HEADER_ROWS = 1000  #: No instrument writes a longer head
 
 POSITION_CHANNELS = ("position_x_m", "position_y_m", "position_z_m")
 """What latitude, longitude and height become: east, north and up of an origin."""
+GROUND_CHANNELS = ("velocity_x_mps", "velocity_y_mps")
+"""What speed and course over ground become: east and north."""
+QUALITY_CHANNELS = ("fix_ratio", "std_position_m")
+"""What the quality of a fix becomes."""
+
+STD_OF_QUALITY_M: Mapping[int, float] = {1: 3.0, 2: 1.0, 3: 1.0, 4: 0.02, 5: 0.5}
+"""Standard deviation of a position at an HDOP of 1, by the code of NMEA 0183's GGA: single, differential, PPS, RTK
+with fixed and with float ambiguities.  Other codes (none, dead reckoning, typed in, simulated) are no fix.  Makers
+state 1 to 3 m of single, about 1 m of differential positions, 1 to 2 cm of RTK and decimetres of its float solution."""
+RTK_FIXED = 4
 
 JOINT_UNITS = {"velocity": "rad/s", "position": "rad", "effort": "Nm"}  #: Of ROS, by field of a joint
 _WORD = re.compile(r"\{([^\W\d]\w*)\}")
@@ -129,13 +139,25 @@ class MessageField(Source):
 
 
 class Position(Strict):
-    """Where latitude and longitude of a receiver are, in ``unit``, and its height in m; the origin is in these."""
+    """Where latitude and longitude of a receiver are, in ``unit``, and its height in m; the origin is in these.
+
+    ``quality`` is the code of NMEA's GGA, which becomes ``fix_ratio`` and, times ``hdop``, ``std_position_m``.
+    """
 
     latitude: Word
     longitude: Word
     height: str = ""
+    quality: str = ""
+    hdop: str = ""
     unit: Literal["deg", "rad"] = "deg"
     origin: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None
+
+
+class Ground(Strict):
+    """Where speed and course over ground of a receiver are; the course is from north, clockwise."""
+
+    speed: Column
+    course: Column
 
 
 class WheelRadius(Strict):
@@ -165,6 +187,7 @@ class TableStream(Strict):
     messages: MessageStream | None = None
     channels: Annotated[dict[str, Column], Field(default_factory=dict)]
     position: Position | None = None
+    ground: Ground | None = None
     sheet: str = ""
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] = ","
     decimal: Literal[".", ","] = "."
@@ -212,17 +235,26 @@ def load_mapping(path: str | Path) -> TableMapping:
     for name, stream in mapping.streams.items():
         place, file = f"{path.name}: stream {name}:", stream.file
         if stream.messages is not None:
-            if stream.channels or stream.position or stream.time:
+            if stream.channels or stream.position or stream.ground or stream.time:
                 raise ConfigError(f"{place} 'messages' leave out time, channels and position")
             check_messages(place, stream.messages)
         elif stream.time is None:
             raise ConfigError(f"{path.name}: key 'streams.{name}.time' is missing")
         else:
-            placed = () if stream.position is None else POSITION_CHANNELS
+            placed, position = tuple[str, ...](), stream.position
+            if position is not None:
+                placed = (*POSITION_CHANNELS, *QUALITY_CHANNELS[: bool(position.quality)])
+                if position.hdop and not position.quality:
+                    raise ConfigError(f"{place} 'hdop' is for positions with 'quality', which scales it")
+            if stream.ground is not None:
+                placed += GROUND_CHANNELS
+                check_unit(f"{place} ground: speed", stream.ground.speed.unit, "mps")
+                check_unit(f"{place} ground: course", stream.ground.course.unit, "rad")
             if not stream.channels and not placed:
                 raise ConfigError(f"{place} has no channels and no position")
             if twice := set(stream.channels).intersection(placed):
-                raise ConfigError(f"{place} 'position' gives the channel {min(twice)} too")
+                by = "ground" if min(twice) in GROUND_CHANNELS else "position"
+                raise ConfigError(f"{place} {by!r} gives the channel {min(twice)} too")
             if stream.decimal == stream.delimiter:
                 both = f"delimiter and decimal are both {stream.decimal!r}"
                 raise ConfigError(f"{place} {both}; numbers with a comma need another delimiter, such as ';'")
@@ -404,10 +436,14 @@ def read_run(
             streams[name] = read_messages(path, name, stream.messages, repairs)
             continue
         assert stream.time is not None
-        position, sources = stream.position, [stream.time, *stream.channels.values()]
+        sources = [stream.time, *stream.channels.values()]
+        position, ground = stream.position, stream.ground
+        if ground is not None:
+            sources += [ground.speed, ground.course]
         placed = []
         if position is not None:
-            placed = [position.latitude, position.longitude, *filter(None, [position.height])]
+            given = position.height, position.quality, position.hdop
+            placed = [position.latitude, position.longitude, *filter(None, given)]
         layout = TextLayout(stream.delimiter, stream.decimal, stream.skip_rows, stream.header_rows)
         columns = [normal_name(each) for each in (*(source.column for source in sources), *placed)]
         table = read_table(path, columns, layout=layout, sheet=stream.sheet, repairs=repairs).T
@@ -416,23 +452,27 @@ def read_run(
             count_rates(time_s, value) if source.rate else value
             for value, source in zip(values, sources[1:], strict=True)
         ]
+        channels, of = [*stream.channels], [source.column for source in sources[1:]]
+        if ground is not None:
+            speed_mps, course_rad = values[-2:]
+            values[-2:] = [speed_mps * np.sin(course_rad), speed_mps * np.cos(course_rad)]
+            channels += GROUND_CHANNELS
         if position is not None:
-            degrees, to_rad = table[len(sources) :], UNIT_SCALES[position.unit][1]
-            origin = np.multiply(position.origin, (to_rad, to_rad, 1.0)) if position.origin else ()
             try:
-                height_m = degrees[2] if position.height else None
-                metres = local_metres(to_rad * degrees[0], to_rad * degrees[1], height_m, origin)
+                found = _positions(position, dict(zip(placed, table[len(sources) :], strict=True)))
             except LogError as error:
                 raise LogError(f"{short_name(path)}: {error}") from error
-            values += [*metres.T[: len(degrees)]]
-            placed[:2] = placed[1::-1]  # east is of the longitude
+            own = {name: each for name, each in found.items() if name not in stream.channels}
+            values += [column for column, _ in own.values()]
+            of += [name for _, name in own.values()]
+            channels += own
         streams[name] = checked_stream(
             short_name(path),
             time_s,
             np.column_stack(values),
-            [*stream.channels, *POSITION_CHANNELS[: len(placed)]],
+            channels,
             row_of=partial(row_number, path, layout=layout),
-            columns=[*(source.column for source in sources[1:]), *placed],
+            columns=of,
             repairs=repairs,
         )
     run_id = (mapping.run_id or "_".join(f"{{{word}}}" for word in words)).format(**words)
@@ -442,6 +482,26 @@ def read_run(
     source = f"{' and '.join(dict.fromkeys(names))}, {by}"
     run = RunLog(run_id, mapping.robot, streams, labels, source, dropped)
     return checked_names(f"run {shown(run_id)}", run)
+
+
+def _positions(position: Position, columns: Mapping[str, Array]) -> dict[str, tuple[Array, str]]:
+    """Return the channels of positions, and the column of each; ``LogError`` as :func:`local_metres`."""
+    to_rad = UNIT_SCALES[position.unit][1]
+    origin = np.multiply(position.origin, (to_rad, to_rad, 1.0)) if position.origin else ()
+    latitude_rad, longitude_rad = (to_rad * columns[name] for name in (position.latitude, position.longitude))
+    found: dict[str, tuple[Array, str]] = {}
+    if position.quality:
+        code = columns[position.quality]
+        std_m = np.array([STD_OF_QUALITY_M.get(int(each), np.nan) for each in np.nan_to_num(code, nan=-1.0)])
+        latitude_rad = np.where(np.isfinite(std_m), latitude_rad, np.nan)
+        hdop = columns[position.hdop] if position.hdop else np.ones(len(code))
+        fixed = np.where(np.isfinite(std_m), code == RTK_FIXED, np.nan)
+        found = {"fix_ratio": (fixed, position.quality), "std_position_m": (std_m * hdop, position.quality)}
+    metres = local_metres(latitude_rad, longitude_rad, columns.get(position.height), origin)
+    # east is of the longitude
+    names = (position.longitude, position.latitude, *filter(None, [position.height]))
+    placed = zip(POSITION_CHANNELS, metres.T, names, strict=False)
+    return {channel: (column, name) for channel, column, name in placed} | found
 
 
 def local_metres(
@@ -466,7 +526,9 @@ def local_metres(
         raise LogError("no latitude and longitude are known")
     farthest = np.abs(latitude_rad[known]).max()
     if farthest > np.pi / 2:
-        raise LogError(f"latitude reaches {np.degrees(farthest):g} deg, 90 is the most")
+        raise LogError(
+            f"latitude reaches {np.degrees(farthest):g} deg, 90 is the most (NMEA has 48.12 deg as 4807.2)"
+        )
     if not len(origin):
         first = int(np.flatnonzero(known)[0])
         base_m = 0.0 if height_m is None or not np.isfinite(height_m[first]) else float(height_m[first])

@@ -15,7 +15,14 @@ TIME_TOLERANCE_S = 1e-6
 _SCALES: dict[str, dict[str, float]] = {
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3},
-    "mps": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6, "mph": 0.44704},
+    "mps": {
+        "m/s": 1.0,
+        "cm/s": 1e-2,
+        "mm/s": 1e-3,
+        "km/h": 1.0 / 3.6,
+        "mph": 0.44704,
+        "knot": 1852.0 / 3600.0,
+    },
     "mps2": {"m/s^2": 1.0, "mm/s^2": 1e-3, "g": GRAVITY_MPS2, "mg": 1e-3 * GRAVITY_MPS2},
     "rad": {"rad": 1.0, "mrad": 1e-3, "deg": 0.017453292519943295},
     "radps": {"rad/s": 1.0, "deg/s": 0.017453292519943295, "rpm": 0.10471975511965977},
@@ -47,6 +54,7 @@ _SPELLINGS = {
     "m/s^2": "m/s2, m/s\u00b2, m s^-2",
     "mm/s^2": "mm/s2, mm/s\u00b2",
     "km/h": "kmh, kph, km/hr",
+    "knot": "knots, kn, kt, kts",
     "deg": "\u00b0, degree, degrees",
     "rad/s": "rad/sec",
     "deg/s": "\u00b0/s, deg/sec",

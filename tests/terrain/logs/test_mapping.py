@@ -2,7 +2,9 @@
 
 import sys
 import unicodedata
+from dataclasses import replace
 from datetime import datetime, timedelta
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -13,12 +15,15 @@ from scipy.io import savemat
 
 from pipelines.data.convert import Settings as ConvertSettings
 from pipelines.data.convert import run as convert
-from pipelines.data.datasets import load_runs
+from pipelines.data.datasets import load_runs, verdict
 from terrain.errors import ConfigError, LogError
 from terrain.logs.mapping import local_metres
 from terrain.logs.run_folders import data_digest
 from terrain.logs.samples import RESPELT
+from terrain.logs.schema import GNSS_CHANNELS
+from terrain.robots import load_robot
 
+ROOT = Path(__file__).resolve().parents[3]
 T, TIME = 0.1 * np.arange(6), {"column": "t", "unit": "s"}
 SPEED = {"speed_left_mps": {"column": "v", "unit": "m/s"}}
 GYRO = {"gyro_z_radps": {"column": "wz", "unit": "deg/s"}}
@@ -242,6 +247,44 @@ def test_latitude_and_longitude_become_metres_of_the_first_fix_or_an_origin(tmp_
         local_metres(np.array([np.nan]), np.array([0.0]))
 
 
+def test_the_worked_mapping_of_an_rtk_log_in_the_docs_reads_one(tmp_path):
+    """Truth of a drive, written as a receiver, an IMU and encoders write it, comes back; codes are fixes."""
+    enu2geodetic = pytest.importorskip("pymap3d").enu2geodetic
+    document = (ROOT / "docs" / "mapping.md").read_text().partition("## A log of an RTK receiver")[2]
+    (tmp_path / "rtk.yaml").write_text(document.split("```yaml\n")[1].partition("```")[0])
+    t = np.arange(0.0, 40.0, 0.1)
+    yaw_rate = 0.3 * np.sin(0.3 * t)
+    yaw, speed = np.cumsum(yaw_rate) * 0.1, 0.8 + 0.3 * np.sin(0.5 * t)
+    v = np.column_stack([speed * np.cos(yaw), speed * np.sin(yaw)])
+    p = np.cumsum(v, axis=0) * 0.1
+    latitude, longitude, _ = enu2geodetic(p[:, 0], p[:, 1], 0.0, 48.1, 11.5, 0.0)
+    code = np.where(t < 1.0, 0, np.where(t < 2.0, 1, np.where(t < 3.0, 5, 4)))
+    drive = tmp_path / "logs" / "field_1"
+    drive.mkdir(parents=True)
+    still, course_deg = np.zeros(len(t)), np.degrees(np.pi / 2 - yaw) % 360.0
+    rtk = (t, latitude, longitude, still + 200.0, code, still + 0.8, speed * 3600 / 1852, course_deg)
+    for name, header, columns in (
+        ("rtk", "time,lat,lon,alt,quality,hdop,sog,cog", rtk),
+        ("imu", "time,wz,ax,ay,az", (t, np.degrees(yaw_rate), still, still, still + 1.0)),
+        ("wheels", "time,left,right", (t, speed - 0.3 * yaw_rate, speed + 0.3 * yaw_rate)),
+    ):
+        table = np.column_stack(columns)
+        np.savetxt(drive / f"{name}.csv", table, "%.12g", ",", header=header, comments="")
+    (run,) = load_runs(tmp_path / "logs", mapping=tmp_path / "rtk.yaml")
+    gnss, known = run.streams["gnss"], code > 0
+    assert set(gnss.channels) == set(GNSS_CHANNELS)
+    position_m = gnss.columns(("position_x_m", "position_y_m"))
+    np.testing.assert_allclose(position_m[known], p[known] - p[known][0], atol=1e-3)
+    assert np.isnan(position_m[~known]).all()
+    np.testing.assert_allclose(gnss.columns(("velocity_x_mps", "velocity_y_mps")), v, atol=1e-6)
+    assert gnss.channel("fix_ratio")[[15, 25, 35]].tolist() == [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(gnss.channel("std_position_m")[[15, 25, 35]], [2.4, 0.4, 0.016])
+    robot = replace(load_robot("husky"), name="field_robot", track_m=0.6)
+    checks = [check for check in verdict(run, robot) if check.check in ("speed", "turns", "yaw rate")]
+    found = {(check.check, str(check.level)) for check in checks}
+    assert found == {("speed", "ok"), ("turns", "ok"), ("yaw rate", "ok")}
+
+
 def test_a_run_is_joined_of_files_of_different_formats_on_one_clock(tmp_path, read):
     savemat(tmp_path / "drive.mat", {"t": T, "wz": T})
     write_sheet(tmp_path / "wheels.xlsx", [("stamp", "v"), *zip(1000 * (T + 0.05), 3.6 + T, strict=True)])
@@ -285,6 +328,9 @@ NO_TABLE = {"messages": {"topic": "/a"}, "time": None, "channels": {}}
         ((), {"terrain": "{ground}"}, "terrain '{ground}' uses a word that the files lack (they have {class}, {n})"),
         (AT, {"decimal": ","}, "delimiter and decimal are both ','"),
         (AT, {"channels": {}}, "has no channels and no position"),
+        (AT, {"ground": {"speed": {"column": "v", "unit": "m"}, "course": {"column": "c", "unit": "deg"}}},
+         "ground: speed: unit 'm' does not suit it"),
+        (AT, {"position": {"latitude": "a", "longitude": "b", "hdop": "h"}}, "'hdop' is for positions with 'quality'"),
         (AT, {"channels": {"position_x_m": {"column": "a", "unit": "m"}},
               "position": {"latitude": "a", "longitude": "b"}}, "'position' gives the channel position_x_m too"),
         (AT, {"messages": {"topic": "/a"}}, "'messages' leave out time, channels and position"),
