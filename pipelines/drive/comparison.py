@@ -60,6 +60,7 @@ from terrain.control.switching import KnownTerrain, TerrainSource
 from terrain.errors import ConfigError
 from terrain.records import RunLog
 from terrain.robots import Robot, load_robot
+from terrain.simulation.assumed import with_assumed
 
 PICTURED = 3  #: Metrics of the first picture
 
@@ -103,7 +104,7 @@ def _terrain_source(controller: Controller, model: TerrainModel | None, robot: R
 
 
 def train_classifier(robot: Robot, seed: int, progress: Progress = silent) -> TerrainModel:
-    """Return a classifier that was trained on simulated labelled runs of a swerve robot, as many as of quickstart.
+    """Return a classifier that was trained on simulated labelled runs of a robot, as many as of quickstart.
 
     The runs differ from the drives of ``terrain drive`` at any seed.
     """
@@ -154,8 +155,8 @@ class DriveResult(Result, eq=False):
 
 def run(settings: Settings, progress: Progress) -> DriveResult:
     """Drive all controllers of the settings at the same seeds, with their robots and table."""
-    robot = load_robot(settings.robot)
-    plant = None if settings.plant is None else load_robot(settings.plant)
+    robot = with_assumed(load_robot(settings.robot))
+    plant = None if settings.plant is None else with_assumed(load_robot(settings.plant))
     table = load_slip_table(settings.table, robot.name)
     return compare(settings, DriveInputs(robot, table, plant=plant), progress)
 

@@ -45,7 +45,8 @@ from terrain.control.robot_control import PilotSettings
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import KnownTerrain
 from terrain.errors import ConfigError
-from terrain.robots import Robot, SwerveRobot, as_drive, load_robot
+from terrain.robots import Robot, load_robot
+from terrain.simulation.assumed import with_assumed
 from terrain.simulation.faults import fault_catalogue, select_faults
 
 DELAY_S = PilotSettings().delay_s  #: From a sample to the wheel
@@ -80,9 +81,7 @@ class FaultsResult(Result, eq=False):
 
 def run(settings: Settings, progress: Progress) -> FaultsResult:
     """Drive each fault in each situation, with the robot and the table of the settings."""
-    refusal = "robot {name}: drive {drive!r} has no pilot, only 'swerve' has"
-    robot = as_drive(SwerveRobot, load_robot(settings.robot), refusal)
-    robot.require(*robot.sections)
+    robot = with_assumed(load_robot(settings.robot))
     slips = None if settings.table is None else load_slip_table(settings.table, robot.name)
     return drive_faults(settings, robot, slips, progress)
 
@@ -164,7 +163,7 @@ def drawn_cases(rows: Sequence[FaultRow], draw: Sequence[str] = ()) -> list[Faul
 
 
 def fault_loop(robot: Robot, slips: SlipTable) -> FaultLoop:
-    """Return the loop of a swerve robot with its pilot, which knows the terrain."""
+    """Return the loop of a robot with its pilot, which knows the terrain."""
     return FaultLoop(robot, partial(_new_pilot, robot, slips), DELAY_S)
 
 

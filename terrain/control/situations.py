@@ -25,6 +25,7 @@ from terrain.simulation.scenario import (
     draw_conditions,
     make_scenario,
 )
+from terrain.simulation.sensors import Gnss
 from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
 
 COURSE = "course"  #: Terrain of scenarios that cross all soils in one drive.
@@ -74,7 +75,7 @@ class SituationOptions:
 def make_situation(
     name: str, robot: Robot, terrain: str, seed: int, options: SituationOptions = SituationOptions()
 ) -> Situation:
-    """Return a situation of :data:`SITUATIONS`, or of the scenarios of ``terrain simulate``, for a swerve robot.
+    """Return a situation of :data:`SITUATIONS`, or of the scenarios of ``terrain simulate``, for a robot.
 
     Load, soil, tyres, roughness and noise are drawn, by seed and terrain alone: a soil, or ``course`` for all of
     them.  ``course`` and ``mixed`` have slopes and undulations as fields have (``data/spread``); all others have
@@ -139,7 +140,10 @@ def make_situation(
 def simulate_situation(
     robot: Robot, situation: Situation, controller: Callable[[Sample], Command], delay_s: float
 ) -> RunLog:
-    """Return the log of a robot in a situation, driven by a controller with a delay from a sample to the wheel."""
+    """Return the log of a robot in a situation, driven by a controller with a delay from a sample to the wheel.
+
+    A robot without a camera has a satellite receiver.
+    """
     return simulate(
         robot,
         situation.scenario,
@@ -150,6 +154,7 @@ def simulate_situation(
         faults=situation.faults,
         controller=controller,
         command_delay_s=delay_s,
+        gnss=None if robot.describes("camera") else Gnss(),
     )
 
 
