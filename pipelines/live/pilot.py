@@ -34,25 +34,9 @@ from terrain.estimation.feed import places_among
 from terrain.estimation.health import SENSORS, Health
 from terrain.estimation.live import CHANNELS, Estimator, LiveEstimate, live_estimator
 from terrain.extension import correct_live
-from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
+from terrain.kinematics.logged_wheels import sensor_channels
 from terrain.records import Command, Sample
 from terrain.robots import Robot
-
-
-def pilot_channels(robot: Robot) -> Mapping[str, tuple[str, ...]]:
-    """Return the channels that a pilot of a robot takes, by stream.
-
-    Examples
-    --------
-    >>> from terrain.robots import load_robot
-    >>> pilot_channels(load_robot("husky"))["wheels"]
-    ('speed_left_mps', 'speed_right_mps', 'current_left_a', 'current_right_a')
-    """
-    if robot.drive == "swerve":
-        return CHANNELS
-    currents = (f"current_{wheel}_a" for wheel in robot.logged_wheels)
-    streams = {"wheels": (*robot.rate_channels, *currents), "imu": IMU_CHANNELS}
-    return streams | {"odometry": ("speed_x_mps", "speed_y_mps"), "gnss": GNSS_CHANNELS}
 
 
 class LivePilot(Chain):
@@ -65,7 +49,7 @@ class LivePilot(Chain):
     source : of the current terrain; without one it stays unknown
     settings : controller and its settings
     channels : of each stream, in the order of the columns of the samples that :meth:`take` is given, by default those
-        of :func:`pilot_channels`; what is not among them is unknown.  Where the steering of a swerve robot is measured,
+        of :func:`~terrain.kinematics.logged_wheels.sensor_channels`; what is not among them is unknown.  Where the steering of a swerve robot is measured,
         :meth:`take` begins with it where it stands
 
     Raises
@@ -102,10 +86,11 @@ class LivePilot(Chain):
         driven, correction = correct_live(robot)
         super().__init__(robot.name, table, SWITCHING, Clocks())
         self.source = TerrainSource() if source is None else source
-        channels = pilot_channels(driven) if channels is None else channels
-        taken = pilot_channels(driven)
+        taken = CHANNELS
         if driven.drive != "swerve":  # their estimator takes what there is
-            taken = {stream: tuple(names) for stream, names in channels.items()}
+            given = sensor_channels(driven) if channels is None else channels
+            taken = {stream: tuple(names) for stream, names in given.items()}
+        channels = taken if channels is None else channels
         if settings.controller not in OPEN_LOOP:
             self._filter = live_estimator(driven, taken, correction)
         states = () if self._filter is None else self._filter.states

@@ -142,7 +142,7 @@ def simulate_situation(
 ) -> RunLog:
     """Return the log of a robot in a situation, driven by a controller with a delay from a sample to the wheel.
 
-    A robot without a camera has a satellite receiver.
+    Robots of other drives than swerve have a satellite receiver, beside a camera where one is described.
     """
     return simulate(
         robot,
@@ -154,7 +154,7 @@ def simulate_situation(
         faults=situation.faults,
         controller=controller,
         command_delay_s=delay_s,
-        gnss=None if robot.describes("camera") else Gnss(),
+        gnss=None if robot.drive == "swerve" else Gnss(),
     )
 
 

@@ -55,6 +55,8 @@ class TractionSettings(NamedTuple):
     #: the command and half the response time of a motor driver; the acceleration that 4 % of the weight gives
     lead_s: float = 0.15
     lead_max_mps2: float = 0.3
+    #: standard deviations of the ground speed that are added to q: what is not known holds no robot back
+    std_ahead: float = 0.0
     balance_margin_ratio: float = 0.03  #: least s* above the slip that balances steady motion
     #: a robot that is held back accelerates at least by this, or the floor of s* rises
     gain_least_mps2: float = 0.25
@@ -122,7 +124,10 @@ def settings_of(robot: Robot) -> TractionSettings:
     settings = SETTINGS
     if not (robot.steered and robot.sideways):
         settings = settings._replace(
-            droop_radps_per_nm=0.0, std_max_ratio=OTHERS_STD_MAX_RATIO, launch_mps=OTHERS_LAUNCH_MPS
+            droop_radps_per_nm=0.0,
+            std_max_ratio=OTHERS_STD_MAX_RATIO,
+            launch_mps=OTHERS_LAUNCH_MPS,
+            std_ahead=0.5,
         )
     motors, torque = robot.completed.motors, robot.mass_kg * robot.wheel_radius_m / len(robot.logged_wheels)
     if motors.speed_gain_nmspr == 0.0:
@@ -244,8 +249,9 @@ def traction_step(
         fastest = abs(speed) / max(1.0 - max(sign * slip, 0.0), 0.05)
         judged = max(fastest, _JUDGED * settings.launch_mps, state.braked_from_mps)
         uncertain = max(uncertain, std * fastest / judged)
-        if ratio >= _SLOWEST_WHEEL_RATIO and sign * speed / ratio < q:
-            q, accel = sign * speed / ratio, sign * wheel_accel / ratio
+        seen = sign * speed + settings.std_ahead * std * fastest
+        if ratio >= _SLOWEST_WHEEL_RATIO and seen / ratio < q:
+            q, accel = seen / ratio, sign * wheel_accel / ratio
     if status is TractionStatus.OK and not wheels.stale_s <= settings.stale_max_s:
         status = TractionStatus.STALE
     if status is TractionStatus.OK and not uncertain <= settings.std_max_ratio:

@@ -2,16 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.wheels import wheel_frame_velocities
-from terrain.logs.schema import TWIST
+from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, TWIST
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 from terrain.slip import traction_slip
+
+
+def sensor_channels(robot: Robot) -> Mapping[str, tuple[str, ...]]:
+    """Return the channels of each stream that the sensors of a robot give, as it is simulated with a receiver.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> channels = sensor_channels(load_robot("husky"))
+    >>> list(channels), channels["wheels"]
+    (['wheels', 'imu', 'odometry', 'gnss'], ('speed_left_mps', 'speed_right_mps', 'current_left_a', 'current_right_a'))
+    """
+    currents = tuple(f"current_{wheel}_a" for wheel in robot.logged_wheels)
+    streams = {"wheels": (*robot.rate_channels, *currents)}
+    streams |= {"steering": robot.steer_channels} if robot.steered else {}
+    streams["imu"] = IMU_CHANNELS
+    if robot.describes("camera"):
+        streams["odometry"] = CAMERA_CHANNELS if robot.drive == "swerve" else TWIST[:2]
+    return streams if robot.drive == "swerve" else streams | {"gnss": GNSS_CHANNELS}
 
 
 def with_wheel_speeds(run: RunLog, robot: Robot) -> RunLog:

@@ -24,19 +24,13 @@ import numpy as np
 from terrain.errors import ConfigError
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import to_body, to_camera
-from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
+from terrain.kinematics.logged_wheels import sensor_channels
 from terrain.records import Array, Command, Reading, Sample
 from terrain.robots import Robot
-from terrain.simulation.sensors import TILT_NOISE_RAD
+from terrain.simulation.sensors import TILT_NOISE_RAD, Gnss
 
-_CHANNELS: Mapping[str, tuple[str, ...]] = {
-    "wheels": WHEELS_CHANNELS,
-    "steering": STEERING_CHANNELS,
-    "imu": IMU_CHANNELS,
-    "odometry": CAMERA_CHANNELS,
-}
-
-STREAMS: tuple[str, ...] = tuple(_CHANNELS)  # streams that faults act on; ``odometry`` is the camera's
+STREAMS = ("wheels", "steering", "imu", "odometry", "gnss")
+"""Streams that faults act on, those that a robot has; ``odometry`` is the camera's."""
 
 
 class Nature(Enum):
@@ -233,16 +227,14 @@ def _chosen(n: int, memory: StreamMemory) -> Array:
     return np.asarray((memory.n_samples + np.arange(n)) % EVERY == EVERY - 1)
 
 
-def _columns(stream: str, start: str) -> list[int] | slice:
-    """Return the columns of a stream whose channels start with a word; all without a stream."""
-    return (
-        [i for i, name in enumerate(_CHANNELS[stream]) if name.startswith(start)] if stream else slice(None)
-    )
+def _columns(channels: Sequence[str], start: str) -> list[int] | slice:
+    """Return the columns of channels that start with a word; all without channels."""
+    return [i for i, name in enumerate(channels) if name.startswith(start)] if channels else slice(None)
 
 
-def frozen(stream: str = "", start: str = "") -> Change:
+def frozen(channels: Sequence[str] = (), start: str = "") -> Change:
     """Repeat the last values before the fault; stamps go on."""
-    columns = _columns(stream, start)
+    columns = _columns(channels, start)
 
     def write(values: Array, memory: StreamMemory) -> None:
         values[:, columns] = _last_values(values, memory)[columns]
@@ -250,9 +242,9 @@ def frozen(stream: str = "", start: str = "") -> Change:
     return written(write)
 
 
-def scaled(stream: str, start: str, factor: float = 1.0, amount: float = 0.0) -> Change:
+def scaled(channels: Sequence[str], start: str, factor: float = 1.0, amount: float = 0.0) -> Change:
     """Multiply channels by a number and add another."""
-    columns = _columns(stream, start)
+    columns = _columns(channels, start)
 
     def write(values: Array, memory: StreamMemory) -> None:
         values[:, columns] = values[:, columns] * factor + amount
@@ -327,7 +319,7 @@ def _of_width(n_columns: int) -> Change:
     return written(write)
 
 
-SPEED_STEP_MPS, MOTOR_FACTOR, PITCH_STEP_RAD, YAW_STEP_RAD = 0.3, 1.2, 0.2, 0.3
+SPEED_STEP_MPS, MOTOR_FACTOR, PITCH_STEP_RAD, YAW_STEP_RAD, POSITION_STEP_M = 0.3, 1.2, 0.2, 0.3, 1.0
 GYRO_STEP_RADPS, ACCEL_STEP_MPS2, STEERING_STEP_RAD = 0.1, 2.0, 0.1
 NOISE_FACTOR, SPIKE = 10.0, 1e6
 LATE_S: tuple[float, ...] = (0.03, 0.1, 0.15)
@@ -340,8 +332,9 @@ EITHER = (
 tells the truth on a straight drive; a heading of the IMU that was set is no slip; wheels that come so late are too slow
 for a control of slip."""
 
-# Number of columns of another robot's streams: one with four wheels, and sensors that report less.
-OTHER_WIDTH: Mapping[str, int] = {"wheels": 4, "steering": 4, "imu": 6, "odometry": 3}
+# Number of columns of another robot's streams: one with four wheels, and sensors that report less; of wheels that have as
+# many, two more.
+OTHER_WIDTH: Mapping[str, int] = {"wheels": 4, "steering": 4, "imu": 6, "odometry": 3, "gnss": 3}
 
 
 def fault_catalogue(robot: Robot) -> dict[str, SensorFault]:
@@ -349,19 +342,23 @@ def fault_catalogue(robot: Robot) -> dict[str, SensorFault]:
 
     Parameters
     ----------
-    robot : a swerve robot with camera and sensors, whose noise is multiplied; names do not depend on it
+    robot : with sensors, whose noise is multiplied; its streams are those of
+        :func:`~terrain.kinematics.logged_wheels.sensor_channels`
 
     Examples
     --------
     >>> from terrain.robots import load_robot
     >>> faults = fault_catalogue(load_robot("agrimaro"))
-    >>> faults["step_camera_speed"].streams, faults["step_camera_speed"].nature.value
-    (('odometry',), 'lying')
+    >>> faults["step_camera_speed"].streams, faults["step_camera_speed"].nature.value, len(faults)
+    (('odometry',), 'lying', 122)
+    >>> len(fault_catalogue(load_robot("husky")))
+    122
     """
     dead, lying, tolerable, degraded = Nature
+    channels = sensor_channels(robot)
     each, cam, some = "each", "odometry", f"of each {EVERY} samples one"
     speed, late_by = f"forward speed {SPEED_STEP_MPS:g} m/s", "samples arrive{} {:g} ms after their stamps"
-    turned, times = f"orientation turned to the left by {YAW_STEP_RAD:g} rad", f"times {MOTOR_FACTOR:g}"
+    times = f"times {MOTOR_FACTOR:g}"
     chance = f"{late_by.format(' up to', 1000 * JITTER_S)}, by chance"
     noisy = f"noise {NOISE_FACTOR:g} times the described one is added"
 
@@ -376,45 +373,63 @@ def fault_catalogue(robot: Robot) -> dict[str, SensorFault]:
     ragged = written(lambda values, memory: [[0.0] * (1 + k) for k in range(len(values) + 1)])
     nothing = shaped(lambda reading: Reading(None, None))  # type: ignore[arg-type]
     twice = shaped(lambda reading: Reading(*(np.repeat(part, 2, axis=0) for part in reading)))
-    offsets = (
+    offsets = [
         ("imu", "pitch", "pitch", PITCH_STEP_RAD, "rad"),
         ("imu", "yaw", "yaw", YAW_STEP_RAD, "rad"),
         ("imu", "gyro_z", "gyro", GYRO_STEP_RADPS, "rad/s"),
         ("imu", "accel_x", "accel", ACCEL_STEP_MPS2, "m/s^2"),
-        ("steering", "angle_1", "steering_1", STEERING_STEP_RAD, "rad"),
+    ]
+    angle, *_ = *channels.get("steering", ()), ""
+    steered = angle.removeprefix("angle_").removesuffix("_rad")
+    offsets += [("steering", angle, f"steering_{steered}", STEERING_STEP_RAD, "rad")] if angle else []
+    of_gnss = (
+        ("speed", "velocity_x", SPEED_STEP_MPS, "m/s"),
+        ("position", "position_x", POSITION_STEP_M, "m"),
     )
+    if "gnss" in channels:
+        offsets += [("gnss", start, f"gnss_{n}", by, unit) for n, start, by, unit in of_gnss]
+        offsets.append(("gnss", "velocity_x", "gnss_speed_down", -SPEED_STEP_MPS, "m/s"))
     clocks = {"clock_forward": 3600.0, "clock_back": -3600.0}
+    wheels = channels["wheels"]
+    rates = [(rate, *_rate_of(rate)) for rate in robot.rate_channels]
     rows: list[tuple[str, str, Nature, str, Change]] = [
         ("loss", each, dead, "no sample arrives", lost),
         ("loss_all", "all", dead, "no sample of any stream arrives", lost),
         ("freeze", each, dead, "all values repeat, stamps go on", frozen()),
         ("freeze_all", "all", dead, "all values of all streams repeat", frozen()),
-        ("freeze_camera_speed", cam, dead, "the forward speed repeats", written(_freeze_camera_speed)),
-        ("freeze_camera_orientation", cam, dead, "the orientation repeats", frozen(cam, "quaternion")),
+    ]
+    seen = _camera_faults(channels[cam]) if cam in channels else ()
+    rows += [(f"freeze_{n}", cam, dead, about, change) for n, is_frozen, about, change in seen if is_frozen]
+    rows += [
+        (f"freeze_{n}", "wheels", dead, f"the {what} repeats", frozen(wheels, rate))
+        for rate, n, what in rates
+    ]
+    gyros = ("gyro", "accel", "pitch")
+    rows += [(f"freeze_{n}", "imu", dead, f"{n} repeats", frozen(channels["imu"], n)) for n in gyros]
+    if angle:
+        about = f"steering angle {steered} repeats"
+        rows.append(
+            (f"freeze_steering_{steered}", "steering", dead, about, frozen(channels["steering"], angle))
+        )
+    if "gnss" in channels:
+        parts = ("velocity", "position")
+        rows += [
+            (f"freeze_gnss_{n}", "gnss", dead, f"the {n} repeats", frozen(channels["gnss"], n)) for n in parts
+        ]
+    rows += [
+        (f"step_{n}", cam, lying, about, change) for n, is_frozen, about, change in seen if not is_frozen
+    ]
+    rate, n, what = rates[0]
+    rows.append((f"step_{n}", "wheels", lying, f"{what} {times}", scaled(wheels, rate, MOTOR_FACTOR)))
+    rows += [
         *(
             (
-                f"freeze_motor_{i}",
-                "wheels",
-                dead,
-                f"the rate of motor {i} repeats",
-                frozen("wheels", f"motor_{i}"),
+                f"step_{n}",
+                stream,
+                lying,
+                f"{n} {by:g} {unit} more",
+                scaled(channels[stream], start, amount=by),
             )
-            for i in (1, 2, 3)
-        ),
-        *((f"freeze_{n}", "imu", dead, f"{n} repeats", frozen("imu", n)) for n in ("gyro", "accel", "pitch")),
-        ("freeze_steering_1", "steering", dead, "steering angle 1 repeats", frozen("steering", "angle_1")),
-        ("step_camera_speed", cam, lying, f"{speed} more", camera_speed_offset(SPEED_STEP_MPS)),
-        ("step_camera_speed_down", cam, lying, f"{speed} less", camera_speed_offset(-SPEED_STEP_MPS)),
-        ("step_camera_yaw", cam, lying, turned, written(_turn_camera)),
-        (
-            "step_motor_1",
-            "wheels",
-            lying,
-            f"rate of motor 1 {times}",
-            scaled("wheels", "motor_1", MOTOR_FACTOR),
-        ),
-        *(
-            (f"step_{n}", stream, lying, f"{n} {by:g} {unit} more", scaled(stream, start, amount=by))
             for stream, start, n, by, unit in offsets
         ),
         ("nan", each, dead, "all values are NaN", filled(math.nan)),
@@ -432,7 +447,8 @@ def fault_catalogue(robot: Robot) -> dict[str, SensorFault]:
         ("ragged", each, dead, "rows of different lengths", ragged),
         *(
             (f"width_{n}", n, dead, f"{n}: samples of another robot, with {width} columns", _of_width(width))
-            for n, width in OTHER_WIDTH.items()
+            for n, names in channels.items()
+            for width in [OTHER_WIDTH[n] + 2 * (OTHER_WIDTH[n] == len(names))]
         ),
         *(
             (f"late_{1000 * by:g}ms", each, tolerable, late_by.format("", 1000 * by), late(by))
@@ -454,12 +470,48 @@ def fault_catalogue(robot: Robot) -> dict[str, SensorFault]:
     for group, stream, nature, about, change in rows:
         kind = group if group in ("nan_some", "minus_inf") else group.partition("_")[0]
         clock_s = clocks[group.removesuffix("_all")] if group.startswith("clock") and stream == "all" else 0.0
-        for one in STREAMS if stream == each else (stream,):
+        for one in tuple(channels) if stream == each else (stream,):
             name, stated = (f"{group}_{one}", f"{one}: {about}") if stream == each else (group, about)
-            streams = STREAMS if stream == "all" else (one,)
+            streams = tuple(channels) if stream == "all" else (one,)
             made = degraded if name in EITHER else nature
             faults[name] = SensorFault(name, kind, stated, streams, made, change, clock_s)
     return faults
+
+
+def _rate_of(channel: str) -> tuple[str, str]:
+    """Return what faults call the rate of a wheel, and what it is in words.
+
+    Examples
+    --------
+    >>> _rate_of("motor_1_radps"), _rate_of("speed_left_mps")
+    (('motor_1', 'rate of motor 1'), ('speed_left', 'speed of the wheels left'))
+    """
+    quantity, wheel = channel.rpartition("_")[0].split("_", 1)
+    return (
+        f"{quantity}_{wheel}",
+        f"rate of motor {wheel}" if quantity == "motor" else f"speed of the wheels {wheel}",
+    )
+
+
+def _camera_faults(channels: Sequence[str]) -> list[tuple[str, bool, str, Change]]:
+    """Return faults of a camera: name, whether it freezes or steps, what it is in words, and what it does."""
+    speed = f"forward speed {SPEED_STEP_MPS:g} m/s"
+    steps = (("camera_speed", "more", 1.0), ("camera_speed_down", "less", -1.0))
+    if tuple(channels) != CAMERA_CHANNELS:
+        ahead = channels[0]
+        held = ("camera_speed", True, "the forward speed repeats", frozen(channels, ahead))
+        by = ((n, word, scaled(channels, ahead, amount=sign * SPEED_STEP_MPS)) for n, word, sign in steps)
+        return [held, *((n, False, f"{speed} {word}", change) for n, word, change in by)]
+    turned = f"orientation turned to the left by {YAW_STEP_RAD:g} rad"
+    return [
+        ("camera_speed", True, "the forward speed repeats", written(_freeze_camera_speed)),
+        ("camera_orientation", True, "the orientation repeats", frozen(channels, "quaternion")),
+        *(
+            (n, False, f"{speed} {word}", camera_speed_offset(sign * SPEED_STEP_MPS))
+            for n, word, sign in steps
+        ),
+        ("camera_yaw", False, turned, written(_turn_camera)),
+    ]
 
 
 def select_faults(catalogue: Mapping[str, SensorFault], names: Sequence[str]) -> list[SensorFault]:
@@ -485,14 +537,19 @@ def noise_std(robot: Robot) -> dict[str, Array]:
 
     A rotation by a small angle changes a quaternion's vector part by half of it; the confidence has none.
     """
-    camera, sensors = robot.camera, robot.sensors
+    sensors, n, receiver = robot.sensors, len(robot.logged_wheels), Gnss()
     imu = [sensors.gyro_std_radps] * 3 + [sensors.accel_std_mps2] * 3 + [TILT_NOISE_RAD] * 2
-    seen = [camera.position_std_m] * 3 + [camera.yaw_std_rad / 2] * 3 + [0.0]
-    seen += [camera.speed_std_mps] * 3 + [camera.yaw_rate_std_radps] * 3 + [0.0]
+    rate = 1.0 if robot.by_motor else robot.wheel_radius_m / robot.motors.reduction_ratio
     std = {
-        "wheels": [sensors.motor_std_radps] * 3 + [sensors.current_std_a] * 3,
-        "steering": [sensors.steering_std_rad] * 3,
+        "wheels": [sensors.motor_std_radps * rate] * n + [sensors.current_std_a] * n,
+        "steering": [sensors.steering_std_rad] * len(robot.steered_wheels),
         "imu": [*imu, sensors.yaw_std_rad],
-        "odometry": seen,
+        "gnss": [receiver.fix_std_m] * 2 + [receiver.speed_std_mps] * 2 + [0.0] * 2,
     }
-    return {stream: np.array(values) for stream, values in std.items()}
+    channels = sensor_channels(robot)
+    if "odometry" in channels:
+        camera = robot.camera
+        seen = [camera.position_std_m] * 3 + [camera.yaw_std_rad / 2] * 3 + [0.0]
+        seen += [camera.speed_std_mps] * 3 + [camera.yaw_rate_std_radps] * 3 + [0.0]
+        std["odometry"] = seen if robot.drive == "swerve" else [camera.speed_std_mps] * 2
+    return {stream: np.array(std[stream]) for stream in channels}
