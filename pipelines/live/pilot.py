@@ -48,9 +48,9 @@ class LivePilot(Chain):
     table : target slips
     source : of the current terrain; without one it stays unknown
     settings : controller and its settings
-    channels : of each stream, in the order of the columns of the samples that :meth:`take` is given, by default those
-        of :func:`~terrain.kinematics.logged_wheels.sensor_channels`; what is not among them is unknown.  Where the steering of a swerve robot is measured,
-        :meth:`take` begins with it where it stands
+    channels : of each stream, in the order of the columns of the samples that :meth:`take` is given; by default those
+        of :func:`~terrain.kinematics.logged_wheels.sensor_channels`, and what is not among them is unknown.  Where the
+        steering of a swerve robot is measured, :meth:`take` begins with it where it stands
 
     Raises
     ------

@@ -108,8 +108,8 @@ def drive_history(
 ) -> DriveHistory:
     """Return the history of a simulated run of a robot.
 
-    Factors are the true radius of each of the first wheels over the nominal one (``Conditions``); without them, wheels of different
-    radii appear to gain energy from the ground.
+    Factors are the true radius of each of the first wheels over the nominal one (``Conditions``); without them, wheels
+    of different radii appear to gain energy from the ground.
     """
     truth, wheels, commands = run.streams["truth"], robot.wheels, run.streams.get("commands")
     time_s, step_s = truth.time_s, float(np.median(np.diff(truth.time_s)))

@@ -18,7 +18,7 @@ import numpy as np
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.control.slip_table import DRIVE_STATES, SIGN, CurveEntry, SlipTable, load_slip_table
 from terrain.records import Array, SlipTarget, TargetStatus
-from terrain.robots import Robot
+from terrain.robots import Robot, SwerveRobot
 from terrain.simulation.run import learning_runs
 from terrain.slip_learning.curve import (
     LAW_PARAMETERS,
@@ -30,7 +30,13 @@ from terrain.slip_learning.curve import (
     tractive_efficiency,
 )
 from terrain.slip_learning.learn import LearnedTerrain, TerrainRun, learn_terrain, terrain_runs
-from terrain.slip_learning.measured import Measured, OperatingPoints, operating_points, surface_slips
+from terrain.slip_learning.measured import (
+    Measured,
+    OperatingPoints,
+    measure_steady,
+    operating_points,
+    surface_slips,
+)
 from terrain.terramechanics.soil import load_soil
 
 FALLBACK = "unknown"
@@ -50,6 +56,12 @@ def simulated_table(
     robot: Robot, terrains: Sequence[str], seed: int, progress: Callable[[int, int], None]
 ) -> SlipTable:
     """Return target slips learned from simulated runs on soils, as ``terrain learn-slip`` learns them."""
+    if not isinstance(robot, SwerveRobot):
+        runs = []
+        for done, terrain in enumerate(terrains, start=1):
+            runs += learning_runs(robot, terrain, seed)
+            progress(done, len(terrains))
+        return learn_surfaces(measure_steady(runs, robot, seed)[1], robot, "learned", seed)[0]
     learned = []
     for done, terrain in enumerate(terrains, start=1):
         measured = [one for log in learning_runs(robot, terrain, seed) for one in terrain_runs(log, robot)]

@@ -332,8 +332,8 @@ EITHER = (
 tells the truth on a straight drive; a heading of the IMU that was set is no slip; wheels that come so late are too slow
 for a control of slip."""
 
-# Number of columns of another robot's streams: one with four wheels, and sensors that report less; of wheels that have as
-# many, two more.
+# Number of columns of another robot's streams: one with four wheels, and sensors that report less; of streams that have
+# as many, two more.
 OTHER_WIDTH: Mapping[str, int] = {"wheels": 4, "steering": 4, "imu": 6, "odometry": 3, "gnss": 3}
 
 
@@ -357,8 +357,7 @@ def fault_catalogue(robot: Robot) -> dict[str, SensorFault]:
     dead, lying, tolerable, degraded = Nature
     channels = sensor_channels(robot)
     each, cam, some = "each", "odometry", f"of each {EVERY} samples one"
-    speed, late_by = f"forward speed {SPEED_STEP_MPS:g} m/s", "samples arrive{} {:g} ms after their stamps"
-    times = f"times {MOTOR_FACTOR:g}"
+    late_by, times = "samples arrive{} {:g} ms after their stamps", f"times {MOTOR_FACTOR:g}"
     chance = f"{late_by.format(' up to', 1000 * JITTER_S)}, by chance"
     noisy = f"noise {NOISE_FACTOR:g} times the described one is added"
 

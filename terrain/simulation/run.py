@@ -353,22 +353,47 @@ LEARNING_DRIVES: tuple[Drive, ...] = (
     Drive("starts", 40.0, 1.8),
     Drive("climb", 2.0, 1.2, 30.0, 0.1, 0.08),
 )
-"""Eight runs that together cover slips from 0 to over 0.5 on every soil."""
+"""Eight runs of a swerve robot that together cover slips from 0 to over 0.5 on every soil."""
+
+
+def learning_drives(robot: Robot) -> tuple[Drive, ...]:
+    """Return what a robot drives for learning slip, each run of it once.
+
+    Where no wheel can be driven against the others, as where sides share theirs, steady motion shows the slip at which
+    thrust balances resistance, and starts and climbs that above it; all within 0.8 of the motors' speed.
+    """
+    if isinstance(robot, SwerveRobot):
+        return LEARNING_DRIVES
+    limit_mps = getattr(robot, "speed_max_mps", robot.wheel_radius_m * robot.motors.speed_max_radps)
+    fast_mps = min(0.8 * limit_mps, 1.2)
+    steady = (Drive("steady", 1.0, part * fast_mps) for part in (0.6, 0.8, 1.0))
+    starts = (Drive("starts", accel_mps2, fast_mps) for accel_mps2 in (1.5, 40.0))
+    return *steady, *starts, Drive("climb", 2.0, fast_mps, 30.0, 0.05, 0.04)
 
 
 def learning_runs(
-    robot: Robot, terrain: str, seed: int, drives: tuple[Drive, ...] = LEARNING_DRIVES
+    robot: Robot, terrain: str, seed: int, drives: tuple[Drive, ...] | None = None
 ) -> list[RunLog]:
-    """Return one run a drive of a swerve robot, with soil, load, slope, tyres and roughness drawn for each."""
+    """Return one run a drive, with soil, load, slope, tyres and roughness drawn for each.
+
+    Drives are those of :func:`learning_drives` by default.
+    """
+    robot = with_assumed(robot)
+    drives = learning_drives(robot) if drives is None else drives
     return [learning_run(robot, terrain, seed, number, drive) for number, drive in enumerate(drives, start=1)]
 
 
 def learning_run(
     robot: Robot, terrain: str, seed: int, number: int, drive: Drive | None = None, run_id: str | None = None
 ) -> RunLog:
-    """Return one run, ``number`` from 1 on; its drive is by default one of :data:`LEARNING_DRIVES` in turn."""
+    """Return one run, ``number`` from 1 on; its drive is by default one of :func:`learning_drives` in turn.
+
+    Robots of other drives than swerve have a satellite receiver, beside a camera where one is described.
+    """
+    robot = with_assumed(robot)
     if drive is None:
-        drive = LEARNING_DRIVES[(number - 1) % len(LEARNING_DRIVES)]
+        drives = learning_drives(robot)
+        drive = drives[(number - 1) % len(drives)]
     nominal = load_soil(terrain)
     key = [seed, zlib.crc32(nominal.name.encode()), zlib.crc32(b"slip"), number]
     drawn, simulated = np.random.SeedSequence(key).spawn(2)
@@ -383,6 +408,7 @@ def learning_run(
         run_id=run_id or f"{nominal.name}_{drive.kind}_{number:02d}",
         conditions=draw_conditions(rng, ground, robot),
         controller=SlipSweep(robot) if drive.kind == "sweep" else None,
+        gnss=None if isinstance(robot, SwerveRobot) else Gnss(),
     )
 
 

@@ -19,7 +19,6 @@ from terrain.simulation.faults import (
     NOISE_FACTOR,
     OTHER_WIDTH,
     SPIKE,
-    STREAMS,
     FaultyBus,
     fault_catalogue,
     noise_std,
@@ -34,6 +33,7 @@ CHANNELS = {
     "imu": IMU_CHANNELS,
     "odometry": CAMERA_CHANNELS,
 }
+STREAMS = tuple(CHANNELS)
 RATE_HZ = {"wheels": 50, "steering": 50, "imu": 100, "odometry": 200}
 STEP_S, START_S, END_S, LENGTH_S = 0.02, 1.0, 3.0, 4.0
 COMMAND = Command(np.zeros(3), np.zeros(3), np.zeros(3), {})
