@@ -313,6 +313,7 @@ _OF_SLIP = tuple(SENSORS.index(name) for name in SLIP_SENSORS)
 # Order in which sensors are named, by health: one that steps or freezes takes others with it, which are lost.
 _NAMED_FIRST = (0, 1, 2, 3, 4, 6, 7, 5)
 _GYRO, _SEEN, _SEEN_YAW = (SENSORS.index(name) for name in ("gyro", "camera_speed", "camera_yaw"))
+LOST_S = 0.1  #: Without a sample of the wheels for so long they are lost.
 POSE_STATES = ("position_x_m", "position_y_m", "yaw_rad")  #: Of a filter that path tracking is built on.
 _NOT_TRACKED = TrackReport(math.nan, math.nan, 0.0, TrackStatus.NO_POSE)
 
@@ -446,7 +447,7 @@ class RobotControl:
         holds : the belief does not age
         """
         step_s = step_or_period(dt_s)
-        sensor, health = self._judge(seen)
+        sensor, health = self._judge(seen, time_s)
         target = self._target(belief.terrain, seen, step_s)
         twist, tracked = self._track(desired, seen, time_s, dt_s)
         twist = self._keep_turn(twist, seen, sound=health <= SOUND, dt_s=dt_s)
@@ -565,7 +566,7 @@ class RobotControl:
         driven_mps = float(np.abs(command).max()) * radius_m
         return command, WheelReport(driven_mps, aimed, math.nan, largest, wheels[0].drive_state, status)
 
-    def _judge(self, seen: LiveEstimate | None) -> tuple[int, int]:
+    def _judge(self, seen: LiveEstimate | None, time_s: float = math.nan) -> tuple[int, int]:
         """Update the health of the sensors; return the place of the least sound, or -1, and its health."""
         if not self._estimates:
             return -1, Health.FRESH
@@ -573,7 +574,9 @@ class RobotControl:
             self.health = [int(Health.LOST)] * len(SENSORS)
             return 0, Health.LOST
         self.health = health = seen.health.tolist()
-        if len(health) != len(SENSORS):  # of other drives only wheels that do not follow are known
+        if len(health) != len(SENSORS):  # of other drives only wheels are judged: that come, and follow
+            if time_s - seen.time_s > LOST_S:
+                return -1, Health.LOST
             return -1, Health.DISAGREES if self._actuation.off.any() else Health.FRESH
         for i in np.flatnonzero(self._actuation.off).tolist():
             if health[i] == Health.LOST or health[i] < Health.DISAGREES:  # it was taken from the filter
