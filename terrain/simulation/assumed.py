@@ -5,7 +5,7 @@ With the mass m, the wheel radius r, the wheelbase L, n wheels that a motor turn
     inertia        a box of the wheelbase and track with the wheels around them, m (l^2 + w^2) / 12; of a wheel and
                    its rotor a tenth of its share of the mass at its radius
     height         r + L / 10 of the centre of mass, in the middle of the contacts
-    tyres          half as wide as their radius, a contact of 0.6 r, relaxed over half of it; they sag by 0.025 r under
+    tyres          0.6 r wide, a contact as long (a roller's of r / 4), relaxed over half of it; they sag by 0.025 r under
                    m g / k, with 0.15 of the critical damping
     motors         a torque of m g r / n, which slips every wheel; the top speed of a Froude number v^2 / (g L) of 0.25,
                    that of a brisk walk; 3000 turns a minute there, at 5/6 of no load: k_t = V / w_0, with 24 V, from
@@ -93,7 +93,7 @@ def _body(robot: Robot) -> dict[str, float]:
     length_m, width_m = np.ptp(places_m, axis=0) + 2.0 * radius_m
     share_kg, sag_m = mass_kg / len(contacts), SAG_RATIO * radius_m
     stiffness_npm = share_kg * GRAVITY_MPS2 / sag_m
-    contact_m, tyre_m = (0.25 if robot.on_omni_wheels else 0.6) * radius_m, 0.5 * radius_m
+    contact_m, tyre_m = (0.25 if robot.on_omni_wheels else 0.6) * radius_m, 0.6 * radius_m
     numbers = {
         "yaw_inertia_kgm2": mass_kg * (length_m**2 + width_m**2) / 12.0,
         "com_height_m": radius_m + 0.1 * robot.wheelbase_m,

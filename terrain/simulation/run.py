@@ -1,10 +1,9 @@
 """All simulated runs: one by objects (:func:`simulate`), one by names (:func:`simulate_run`), and what is learned from.
 
 A plant (:mod:`terrain.simulation.plants`) goes with the ground that it is given: soils by the terrains of a scenario
-are driven by the dynamic plant of swerve robots, a planar ground by the planar one of any wheeled robot, a soil that
-shears, or prescribed slip, by tracks, and ground along a drive by a car with its controller.  By names, swerve robots
-are simulated by the dynamic plant, tracked ones on ground that shears by their tracks, all others, and whatever has
-effects, by the planar plant.
+are driven by the dynamic plant, a planar ground by the planar one, a soil that shears, or prescribed slip, by tracks,
+and ground along a drive by a car with its controller.  By names, robots of every drive are simulated by the dynamic
+plant, and what has effects, but for swerve robots, by the planar plant.
 
 **Bench**: a simulated IMU, held still in six positions in turn (Danzi, AgriMaRo thesis, 3.3.3).
 
@@ -44,7 +43,16 @@ from terrain.simulation.scenario import (
     draw_conditions,
     make_scenario,
 )
-from terrain.simulation.sensors import Gnss, draw_imu_errors, imu_values, is_lost
+from terrain.simulation.sensors import (
+    FIELD_CAMERAS,
+    RAW_FIXES,
+    Gnss,
+    Poses,
+    draw_imu_errors,
+    imu_values,
+    is_lost,
+    poses_of,
+)
 from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
 
 if TYPE_CHECKING:
@@ -87,7 +95,8 @@ def simulate(
     faults : faults of the sensors
     effects : parameters of :mod:`terrain.effects` that act on this robot and its sensors, beside those of its
         description or in place of them; the commands and the log do not contain them
-    options : of the plant: :func:`~terrain.simulation.plants.dynamic.run_dynamic` (gnss, controller, command_delay_s),
+    options : of the plant: :func:`~terrain.simulation.plants.dynamic.run_dynamic` (gnss, poses, compass, controller,
+        command_delay_s),
         :func:`~terrain.simulation.plants.planar.run_planar` (scatter, noise, outside, heading, fixes, terrain),
         :func:`~terrain.simulation.plants.tracks.run_tracked` (slope, yaw_rad, sensors),
         :func:`~terrain.simulation.plants.car.run_car` (controller, noise)
@@ -155,6 +164,7 @@ def simulate_run(
     conditions: Conditions | None = None,
     faults: Faults | None = None,
     gnss: Gnss | None = None,
+    poses: Poses | None = None,
     effects: Mapping[str, float] | None = None,
 ) -> RunLog:
     """Return one simulated run by names.
@@ -164,7 +174,7 @@ def simulate_run(
 
     Parameters
     ----------
-    robot : swerve robot with all sections, or another robot with all but steering; or its name or YAML file
+    robot : any, or its name or YAML file; sections that it lacks are assumed
     terrain : name of a soil or path of its YAML file, or ``course`` for all soils in one run
     scenario : name of a scenario; ``course`` goes with the terrain ``course``, ``six_positions`` (the IMU alone, for
         calibration) with ``bench``; ``slip`` sweeps the slip of the wheels under varied conditions; or what is to be
@@ -173,7 +183,7 @@ def simulate_run(
     duration_s : length; the scenario's own by default
     vary : draw soil, slope, load, tyres and roughness for this run by ``data/soils`` and ``data/spread``
     conditions, faults, effects : as :func:`simulate` has them, conditions about which they vary
-    gnss : receiver on board, if any
+    gnss, poses : receiver on board, and what sees its pose from outside, beside what :func:`instruments` has
 
     Raises
     ------
@@ -212,9 +222,9 @@ def simulate_run(
     if scenario == SLIP:
         if terrain == COURSE:
             raise ConfigError(f"scenario {SLIP!r} is driven on one terrain, not on 'course'")
-        if duration_s is not None or conditions not in (None, Conditions()) or gnss is not None:
+        if (duration_s, gnss, poses) != (None, None, None) or conditions not in (None, Conditions()):
             raise ConfigError(
-                f"scenario {SLIP!r} draws its conditions: leave duration, grade, payload and gnss out"
+                f"scenario {SLIP!r} draws its conditions: leave duration, grade, payload, gnss and pose out"
             )
         if faults not in (None, NO_FAULTS):
             raise ConfigError(f"scenario {SLIP!r} has no faults on purpose: leave the camera's loss out")
@@ -235,25 +245,20 @@ def simulate_run(
     drive_seed = int(driven.generate_state(1)[0])
     drive = commands or make_scenario(scenario, robot, list(soils), duration_s, seed=drive_seed)
     ground: Any = soils
-    options: dict[str, Any] = {"gnss": gnss}
+    options: dict[str, Any] = instruments(robot, gnss, poses)
     effects = effects or {}
     if not dynamic:
-        ground, options = soils[terrain], {}
-        if (
-            not isinstance(robot, TrackedRobot)
-            or ground.law != "janosi"
-            or {**robot.effects, **effects}
-            or robot.learned
-        ):
-            from terrain.simulation.plants.planar import planar_ground, spread_numbers
+        from terrain.simulation.plants.planar import planar_ground, spread_numbers
 
-            if gnss is not None:
-                raise ConfigError(f"robot {robot.name}: its simulation has no receiver, leave gnss out")
-            scatter = spread_numbers("scatter")
-            if not vary:  # the scatter of its sensors stays
-                scatter |= {name: 0.0 for name in NUISANCES if name in PARAMETER and name not in SENSED_ONLY}
-            ground, options = planar_ground(robot, ground), {"scatter": scatter}
-            options |= {"noise": spread_numbers("noise"), "fixes": isinstance(robot, BicycleRobot)}
+        if gnss is not None or poses is not None:
+            raise ConfigError(
+                f"robot {robot.name}: with effects no receiver or pose is simulated, leave them out"
+            )
+        scatter = spread_numbers("scatter")
+        if not vary:  # the scatter of its sensors stays
+            scatter |= {name: 0.0 for name in NUISANCES if name in PARAMETER and name not in SENSED_ONLY}
+        ground, options = planar_ground(robot, soils[terrain]), {"scatter": scatter}
+        options |= {"noise": spread_numbers("noise"), "fixes": isinstance(robot, BicycleRobot)}
     options |= {"conditions": conditions, "faults": faults or NO_FAULTS, "effects": effects}
     run_id = run_id_of(terrain, scenario, number)
     run = simulate(robot, drive, ground, simulated, run_id=run_id, **options)
@@ -263,8 +268,21 @@ def simulate_run(
 
 def _dynamic(robot: Robot, effects: Mapping[str, float] | None) -> bool:
     """Return whether the dynamic plant simulates a robot by names; of effects, those of swerve robots alone."""
-    plain = effects is None and not robot.effects and not robot.learned
-    return isinstance(robot, SwerveRobot) or (plain and robot.drive == "skid_steer")
+    return isinstance(robot, SwerveRobot) or not (effects is not None or robot.effects or robot.learned)
+
+
+def instruments(robot: Robot, gnss: Gnss | None = None, poses: Poses | None = None) -> dict[str, Any]:
+    """Return what measures a robot from outside: what is asked for, and what its drive has in the papers of it.
+
+    Tracked robots have cameras around the field, raw fixes and a compass, car-like ones the last two, and robots on omni
+    wheels a camera above.
+    """
+    tracked, car = isinstance(robot, TrackedRobot), isinstance(robot, BicycleRobot)
+    if poses is None and (tracked or robot.on_omni_wheels):
+        poses = FIELD_CAMERAS if tracked else poses_of(robot)
+    if gnss is None and (tracked or car):
+        gnss = RAW_FIXES
+    return {"gnss": gnss, "poses": poses, "compass": tracked or car}
 
 
 def run_id_of(terrain: str, scenario: str, number: int) -> str:

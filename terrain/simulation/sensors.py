@@ -27,7 +27,7 @@ from terrain.kernels import inner, njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import to_camera
 from terrain.kinematics.wheels import point_velocity
-from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, TWIST
+from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, POSE_CHANNELS, TWIST
 from terrain.records import Array, Reading, Stream, read_only
 from terrain.robots import Antenna, Robot, Sensors, SwerveRobot
 from terrain.simulation.scenario import Faults
@@ -555,9 +555,62 @@ def fixes(rows: Array, noise: Array, std_m: Array | float, fixed: Array | float 
     return np.column_stack([values, std_m * one, fixed * one])
 
 
+class Poses(NamedTuple):
+    """What sees the pose of a robot in a fixed frame: a lidar that is matched with a map, or cameras around the field.
+
+    Rates and noise are assumed, but those that come of a description (:func:`poses_of`).
+    """
+
+    rate_hz: float = 10.0
+    latency_s: float = 0.0
+    position_std_m: float = 0.02
+    yaw_std_rad: float = 0.005
+    lever_x_m: float = 0.0  # of what is seen, from the body's origin
+    lever_y_m: float = 0.0
+
+
+FIELD_CAMERAS = Poses(100.0, 0.0, 0.001, 0.002)  # around a small field
+
+
+def poses_of(robot: Robot) -> Poses:
+    """Return a camera above a robot that its description has; without one, :class:`Poses` as they are."""
+    camera = robot.parts.get("camera")
+    return Poses(**{name: getattr(camera, name) for name in Poses._fields}) if camera else Poses()
+
+
+def pose_sensor(motion: Motion, poses: Poses, rng: np.random.Generator, faults: Faults) -> Sensor:
+    """Return poses (x, y, yaw) in the world frame, with white noise; lost samples are left out."""
+    time_s, rows = motion.at(poses.rate_hz, poses.latency_s)
+    std = np.array([poses.position_std_m, poses.position_std_m, poses.yaw_std_rad])
+    noise = std * rng.standard_normal((len(rows), 3))
+    seen = ~is_lost(time_s, faults.camera_lost_s)
+
+    def write(new: slice, rows: Array, _: Array) -> Array:
+        at = motion.record[rows]
+        lever = (poses.lever_x_m + 1j * poses.lever_y_m) * np.exp(1j * at["yaw_rad"])
+        place = at["position_x_m"] + lever.real, at["position_y_m"] + lever.imag
+        values = np.column_stack([*place, at["yaw_rad"]]) + noise[seen][new]
+        values[:, 2] = wrapped(values[:, 2])
+        return values
+
+    return Sensor(motion, POSE_CHANNELS, (time_s[seen], rows[seen]), write)
+
+
+def compass_sensor(motion: Motion, rng: np.random.Generator) -> Sensor:
+    """Return the heading of a compass, with white noise."""
+    time_s, rows = motion.at(RAW_HZ)
+    noise = COMPASS_STD_RAD * rng.standard_normal(len(rows))
+
+    def write(new: slice, rows: Array, _: Array) -> Array:
+        return np.asarray(wrapped(motion.record["yaw_rad"][rows] + noise[new]))[:, None]
+
+    return Sensor(motion, ("yaw_rad",), (time_s, rows), write)
+
+
 # Rate and noise of raw fixes (Deremetz et al., ICRA 2017, section VI), and of a compass (half a degree, assumed); noise
 # of a velocity over that of the position, as the Doppler speed of the other receiver.
 RAW_HZ, RAW_STD_M, COMPASS_STD_RAD, SPEED_FACTOR_PS = 10.0, 0.02, 0.0087, 1.5
+RAW_FIXES = Gnss(RAW_HZ, 0.0, RAW_STD_M, speed_std_mps=SPEED_FACTOR_PS * RAW_STD_M, fix_length_s=math.inf)
 
 
 def raw_fixes(

@@ -39,15 +39,15 @@ from terrain.kernels import filled, njit, numbers, record
 from terrain.records import Array
 from terrain.terramechanics.soil import Soil
 
-#: A soil under a wheel: whether it is a road, the wheel, and the numbers of :class:`Soil`, with tan(phi) and
-#: k = kc + b kphi.
+#: A soil under a wheel: whether it is a road, whether it carries a plate and no wheel, the wheel, and the numbers of
+#: :class:`Soil`, with tan(phi) and k = kc + b kphi.
 GROUND = record(
     numbers(
         "wheel_radius_m tyre_width_m contact_length_m cohesion_pa tan_friction shear_modulus_m "
         "stiffness_ratio shape_ratio peak_friction_ratio curvature_ratio sinkage_modulus "
         "sinkage_exponent_ratio rolling_resistance_ratio slip_sinkage_ratio"
     )
-    | {"hard": bool}
+    | {"hard": bool, "plate": bool}
 )
 _SMALL = 0.01  #: Below this s l / K a series is nearer the truth than a difference of nearly equal numbers
 
@@ -220,19 +220,23 @@ def contact_length(sinkage_m: float, wheel_radius_m: float, tyre_contact_m: floa
     return max(tyre_contact_m, wheel_radius_m * math.acos(1.0 - depth))
 
 
-def ground_record(soil: Soil, wheel_radius_m: float, tyre_width_m: float, contact_length_m: float) -> Array:
+def ground_record(
+    soil: Soil, wheel_radius_m: float, tyre_width_m: float, contact_length_m: float, strips: int = 0
+) -> Array:
     """Return a soil under a wheel, (1,) of :data:`GROUND`, whose contact on firm ground has a length.
 
-    Numbers that the soil does not have are 0; a sinkage modulus of 0 is ground that does not yield.
+    Numbers that the soil does not have are 0; a sinkage modulus of 0 is ground that does not yield.  Under a track
+    that is cut lengthwise into so many ``strips``, it is that under one of them: together they sink, shear and compact
+    as the track does.
     """
     known = {
         "wheel_radius_m": wheel_radius_m,
-        "tyre_width_m": tyre_width_m,
+        "tyre_width_m": tyre_width_m / max(strips, 1),
         "contact_length_m": contact_length_m,
         "tan_friction": math.tan(soil.friction_angle_rad),
-        "sinkage_modulus": soil.kc_npmn1 + tyre_width_m * soil.kphi_npmn2,
+        "sinkage_modulus": (soil.kc_npmn1 + tyre_width_m * soil.kphi_npmn2) / max(strips, 1),
     }
-    ground = filled(GROUND, hard=soil.law == "magic")
+    ground = filled(GROUND, hard=soil.law == "magic", plate=strips > 0)
     for name in GROUND.names or ():
         value = known.get(name, getattr(soil, name, math.nan))
         if math.isfinite(value):
@@ -268,7 +272,10 @@ def wheel_ground(
     resistance = rolling_resistance(normal_n, ground.rolling_resistance_ratio)
     sinkage = 0.0
     if modulus > 0.0:
-        sinkage = rigid_wheel_sinkage(normal_n, radius, modulus, exponent)
+        if ground.plate:
+            sinkage = math.pow(normal_n / (modulus * ground.contact_length_m), 1.0 / exponent)
+        else:
+            sinkage = rigid_wheel_sinkage(normal_n, radius, modulus, exponent)
         sinkage = min(sinkage * slip_sinkage_factor(slip_x, ground.slip_sinkage_ratio), radius)
         resistance += compaction_resistance(sinkage, modulus, exponent)
     slip = math.hypot(slip_x, slip_y)

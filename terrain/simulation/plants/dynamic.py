@@ -72,6 +72,7 @@ delay later, one step at the least.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -81,7 +82,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects import EFFECTS, Stage, checked_effects, in_plant, on_samples, parameters_of, vector_of
+from terrain.effects import EFFECTS, Stage, checked_effects, in_plant, on_samples, vector_of
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.extension import apply_homes
 from terrain.kernels import filled, inner, is_finite, njit, numbers, record
@@ -90,12 +91,12 @@ from terrain.kinematics.wheels import point_velocity, rolled_twist
 from terrain.learned_term import INPUTS, Factor, rolling_change
 from terrain.logs.schema import TWIST, unit_of
 from terrain.records import Array, Command, Label, Sample, Stream, read_only
-from terrain.robots import Robot, SwerveRobot
+from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot
 from terrain.simulation import sensors as sensing
 from terrain.simulation.assumed import with_assumed
-from terrain.simulation.contacts import Contact, contacts_of
+from terrain.simulation.contacts import TRACK_PATCHES, Contact, contacts_of
 from terrain.simulation.scenario import Conditions, Faults, Scenario
-from terrain.simulation.sensors import BODY_ROW, STEP_S, Gnss, Motion
+from terrain.simulation.sensors import BODY_ROW, STEP_S, Gnss, Motion, Poses
 from terrain.terramechanics.soil import Soil
 from terrain.terramechanics.traction import GROUND, ground_record, wheel_ground
 
@@ -116,6 +117,10 @@ COUNTED_S = (
 CONTACT_LIMIT_PS2 = 4.0 / (STEP_S * (STEP_S + 2.0 * DEFLECTION_DAMPING_S))  # largest stable ``k`` in 1/s^2
 # Load transfer and rough ground load a wheel with up to so many times its share of the weight.
 LOAD_MARGIN_RATIO = 2.0
+
+# A contact that is stiffer than the steps allow, by so much at most, as those of small wheels are, relaxes over a
+# longer distance: slip in steady motion is the same.
+MAX_RELAXED = 4.0
 
 _SMALL_SLIP = 1e-4
 
@@ -246,10 +251,11 @@ def patches_on(
 ) -> Array:
     """Return soils under the wheels of a robot, with their roughness and starts, (soils,) of :data:`PATCH`."""
     body, patches = robot.body, np.zeros(len(soils), PATCH)
+    wheel: Any = robot.wheel_radius_m, body.tyre_width_m, body.contact_length_m
+    if isinstance(robot, TrackedRobot):
+        wheel = robot.wheel_radius_m, robot.track_width_m, robot.contact_length_m, TRACK_PATCHES
     for patch, soil in zip(patches, soils, strict=True):
-        (patch["ground"],) = ground_record(
-            soil, robot.wheel_radius_m, body.tyre_width_m, body.contact_length_m
-        )
+        (patch["ground"],) = ground_record(soil, *wheel)
         patch["roller_friction_ratio"] = np.nan_to_num(soil.roller_friction_ratio)
     patches["roughness_m3"], patches["start_m"] = roughness_m3, start_m
     return patches
@@ -267,7 +273,7 @@ def make_plant(robot: Robot, conditions: Conditions) -> Array:
     steering = [robot.steering] if robot.steered else []
     parts = (*steering, body, motors, sensors, conditions)  # a torque is that of the motors
     described = {n: getattr(part, n) for part in parts for n in PLANT.names or () if hasattr(part, n)}
-    effects = dict.fromkeys(parameters_of(robot.drive), 0.0) | dict(robot.effects)
+    effects = defaultdict(float, robot.effects)
     mass_kg = robot.mass_kg * (1.0 + effects["payload_ratio"]) + conditions.payload_kg
     n, half = len(robot.wheels), 0.5 * effects["one_sided_radius_ratio"]
     rolling = (1.0 + effects["wheel_radius_ratio"]) * np.array([*[1.0 - half] * (n - 1), 1.0 + half])
@@ -292,8 +298,8 @@ def make_plant(robot: Robot, conditions: Conditions) -> Array:
         "wheel_direction_rad": robot.wheel_directions_rad,
         "wheel_roller_rad": robot.roller_angles_rad,
         "radius_m": robot.wheel_radius_m * factors * rolling,
-        "driven": np.ones(n),
-        "steer_offset_rad": [effects.get(f"steering_offset_{i + 1}_rad", 0.0) for i in range(n)],
+        "driven": np.isin(robot.wheels, robot.logged_wheels),
+        "steer_offset_rad": [effects[f"steering_offset_{i + 1}_rad"] for i in range(n)],
     }
     of_robot = {
         "com_m": com_m,
@@ -307,9 +313,9 @@ def make_plant(robot: Robot, conditions: Conditions) -> Array:
         "encoder_time_constant_s": max(sensors.encoder_time_constant_s, COUNTED_S),
         "leg_backlash_rad": conditions.leg_backlash_rad if isinstance(robot, SwerveRobot) else 0.0,
         "hall_steps": sensors.hall_steps_ratio * motors.reduction_ratio / (2 * math.pi),
-        "linked": any(effects[name] != 0.0 for name in in_plant(Stage.LINKAGE) if name in effects),
-        "yields": any(effects[name] != 0.0 for name in in_plant(Stage.CONTACT) if name in effects),
-        "effects": vector_of(effects).view(EFFECTS),
+        "linked": any(effects[name] != 0.0 for name in in_plant(Stage.LINKAGE)),
+        "yields": any(effects[name] != 0.0 for name in in_plant(Stage.CONTACT)),
+        "effects": vector_of(robot.effects).view(EFFECTS),
     }
     plant = filled(PLANT, **(described | of_robot))
     for name, values in wheels.items():
@@ -339,15 +345,10 @@ def start_state(steer_rad: Array) -> Array:
     return state
 
 
-def check_step(plant: Array, profile: TerrainProfile, name: str) -> None:
-    """Refuse a robot on its terrain whose contacts or tyres are too stiff for the steps of the integration.
+def contact_stiffness(plant: Array, profile: TerrainProfile) -> float:
+    """Return how stiff contacts are under its weight on its stiffest ground over what the steps allow.
 
-    Contacts are those under its weight on its stiffest ground.
-
-    Raises
-    ------
-    ConfigError
-        if the contacts, with :data:`LOAD_MARGIN_RATIO`, or the tyres are beyond their limit, or not finite.
+    With :data:`LOAD_MARGIN_RATIO`.
     """
     robot, mass_kg = plant[0], float(plant["mass_kg"][0])
     contacts = robot["contacts"][: robot["n_contacts"]]
@@ -360,7 +361,19 @@ def check_step(plant: Array, profile: TerrainProfile, name: str) -> None:
         stiffness_npm = slope_n / robot["relaxation_length_m"]
         wheels = np.bincount(contacts["wheel"], stiffness_npm * spin)  # contacts of a wheel push it together
         rates_ps2.append(wheels.max() + (stiffness_npm * body).sum())
-    contact = LOAD_MARGIN_RATIO * float(np.max(rates_ps2)) / CONTACT_LIMIT_PS2
+    return LOAD_MARGIN_RATIO * float(np.max(rates_ps2)) / CONTACT_LIMIT_PS2
+
+
+def check_step(plant: Array, profile: TerrainProfile, name: str) -> None:
+    """Refuse a robot on its terrain whose contacts or tyres are too stiff for the steps of the integration.
+
+    Raises
+    ------
+    ConfigError
+        if the contacts, as :func:`contact_stiffness` has them, or the tyres are beyond their limit, or not finite.
+    """
+    robot, mass_kg = plant[0], float(plant["mass_kg"][0])
+    contacts, contact = robot["contacts"][: robot["n_contacts"]], contact_stiffness(plant, profile)
     damped = STEP_S * robot["tyre_stiffness_npm"] + 2.0 * robot["tyre_damping_nspm"]
     tyre = STEP_S * damped / 4.0 / (mass_kg * float(contacts["load_fraction"].min()))
     steps = f"robot {name}: its motion cannot be integrated in steps of {STEP_S:g} s: "
@@ -733,7 +746,7 @@ MIN_LABEL_S = 0.5  # A shorter stay on one ground gets no label
 MAX_WHEEL_SPEEDS = 100.0
 MAX_COMMAND_DELAY_S = 0.5  # longest delay of a command to the wheels; a later one is no control
 
-_PURPOSES = ("terrain", "road", "start", "wheels", "steering", "imu", "camera", "gnss")
+_PURPOSES = ("terrain", "road", "start", "wheels", "steering", "imu", "camera", "gnss", "pose", "compass")
 
 
 def run_dynamic(
@@ -746,6 +759,8 @@ def run_dynamic(
     faults: Faults,
     effects: Mapping[str, float],
     gnss: Gnss | None = None,
+    poses: Poses | None = None,
+    compass: bool = False,
     controller: Callable[[Sample], Command] | None = None,
     command_delay_s: float = 0.0,
 ) -> tuple[dict[str, Stream], tuple[Label, ...]]:
@@ -755,7 +770,8 @@ def run_dynamic(
     ----------
     robot : of any drive; sections that it lacks are those of :func:`~terrain.simulation.assumed.with_assumed`
     soils : by the terrain names of the scenario
-    gnss : receiver on board, if any
+    gnss, poses : receiver on board, and what sees its pose from outside, if any
+    compass : whether a compass shows its heading, ten times a second
     controller : called once an instant of the scenario with the samples that arrived since the instant before, as the
         log has them; before its first command is in force, the wheels are commanded to stand and the steering to stay
         at 0.  Without one the wheels are commanded to follow the desired twists
@@ -792,6 +808,9 @@ def run_dynamic(
         built = apply_homes(built, in_plant(Stage.DESCRIPTION))
     profile = draw_profile(built, scenario, soils, conditions, rngs["terrain"])
     plant = make_plant(built, conditions)
+    stiff = contact_stiffness(plant, profile)
+    if 1.0 < stiff <= MAX_RELAXED:
+        plant["relaxation_length_m"] *= stiff
     check_step(plant, profile, built.name)
     n_steps = len(scenario.time_s) * substeps
     n_wheels, n_contacts = len(robot.wheels), int(plant["n_contacts"][0])
@@ -805,10 +824,14 @@ def run_dynamic(
     if robot.steered:
         sensors["steering"] = sensing.steering_sensor(motion, built, rngs["steering"])
     sensors["imu"] = imu
-    if robot.describes("camera"):
+    if robot.describes("camera") and not robot.on_omni_wheels:
         sensors["odometry"] = sensing.camera_sensor(motion, built, rngs["camera"], faults)
     if gnss is not None:
         sensors["gnss"] = sensing.gnss_sensor(motion, built, gnss, rngs["gnss"])
+    if poses is not None:
+        sensors["pose"] = sensing.pose_sensor(motion, poses, rngs["pose"], faults)
+    if compass:
+        sensors["compass"] = sensing.compass_sensor(motion, rngs["compass"])
     for name, sensor in sensors.items():
         stamped = on_samples(name, (), built.effects)(sensor.time_s.copy(), sensor.values)
         sensor.stamp_s = read_only(stamped[0])
@@ -919,6 +942,8 @@ def dynamic_truth(motion: Motion, robot: Robot, gyro_bias_radps: Array, gyro_tim
     time_s, at = motion.at(sensing.TRUTH_HZ)
     rows = motion.record[at]
     of_wheels = {name: rows["wheels"][name][:, : len(robot.wheels)] for name in _WHEEL_TRUTH}
+    if isinstance(robot, BicycleRobot):  # of its axles, slip is an angle first
+        of_wheels["slip_rad"] = of_wheels.pop("slip_angle_rad")
     bias = {sensing.GYRO_BIAS: np.interp(time_s, gyro_time_s, gyro_bias_radps)}
     truth = sensing.truth_stream(time_s, rows, robot.wheels, of_wheels, bias)
     known = np.asarray(np.isfinite(truth.values).any(axis=0))
