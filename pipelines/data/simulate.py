@@ -4,16 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from pipelines.report.numbers import plural
+from pipelines.report.numbers import enumerated, plural
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
-from pipelines.report.tree import Report
+from pipelines.report.tree import Report, Text
 from terrain.errors import ConfigError, LogError
+
+if TYPE_CHECKING:
+    from terrain.records import RunLog
+    from terrain.robots import Robot
 
 EXAMPLE = "terrain simulate --robot husky --terrain grass --scenario survey --runs 8 --out runs/"
 EVERY = "all"  #: Given in place of a terrain: each soil in turn
+STUCK_RATIO = 0.2  #: Of the distance that its wheels roll, below which a robot hardly moves
+REFERENCES = ("odometry", "gnss", "pose")  #: Streams by which a speed over ground is known
 
 
 class Settings(BaseSettings):
@@ -35,6 +42,7 @@ class Settings(BaseSettings):
     camera_lost: tuple[str, ...] = setting((), repeated=True)
     """START:END in s without the camera; may be given again."""
     gnss: bool = setting(False, "With an RTK receiver on board.")
+    pose: bool = setting(False, "With poses (x, y, yaw) of a lidar or of cameras in a fixed frame.")
     effect: tuple[str, ...] = setting((), repeated=True)
     """NAME=VALUE of an effect that acts, as wheel_radius=0.03; may be given again."""
 
@@ -50,6 +58,7 @@ class SimulatedRuns(Result):
     n_runs: int = described("number of runs")
     run_ids: tuple[str, ...] = described("names of the runs")
     duration_s: float = described("of all runs together", "s")
+    limits: tuple[str, ...] = described("what these runs cannot show, a sentence each")
 
 
 def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
@@ -63,7 +72,7 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
     from terrain.robots import load_robot
     from terrain.simulation.run import BENCH_TERRAIN, COURSE, run_id_of, simulate_run
     from terrain.simulation.scenario import COMMANDS, Conditions, Faults, Scenario, from_commands
-    from terrain.simulation.sensors import Gnss
+    from terrain.simulation.sensors import Gnss, Poses
     from terrain.terramechanics.soil import load_soil, soil_names
 
     scenario, out = settings.scenario, settings.out
@@ -90,7 +99,7 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
             raise LogError(f"{folder}: is there already, and is left as it is; choose another --out")
     gradient = math.tan(math.radians(settings.grade_deg))
     run_ids: list[str] = []
-    total_s = 0.0
+    stuck, total_s = dict[str, None](), 0.0
     for done, (name, number) in enumerate(jobs, 1):
         driven: str | Scenario = scenario
         if commands is not None:
@@ -106,15 +115,79 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
             conditions=Conditions(payload_kg=settings.payload_kg, grade_ratio=(gradient, 0.0)),
             faults=Faults(camera_lost_s=tuple(camera_lost_s)),
             gnss=Gnss() if settings.gnss else None,
+            poses=Poses() if settings.pose else None,
             effects=effects or None,
         )
         write_run(simulated, out)
         run_ids.append(simulated.run_id)
+        stuck |= dict.fromkeys(simulated.terrains if hardly_moves(simulated, robot) else ())
         total_s += simulated.streams["imu" if "imu" in simulated.streams else "wheels"].duration_s
         progress("simulate", done, len(jobs))
     return SimulatedRuns(
-        out, robot.name, scenario, settings.seed, effects, len(run_ids), tuple(run_ids), total_s
+        out,
+        *(robot.name, scenario, settings.seed, effects, len(run_ids), tuple(run_ids), total_s),
+        limits_of(simulated, robot, bool(effects), list(stuck)),
     )
+
+
+def hardly_moves(run: RunLog, robot: Robot) -> bool:
+    """Return whether the wheels of a simulated run roll far and take the robot nowhere."""
+    import numpy as np
+
+    from terrain.kinematics.wheels import rolled_twist
+
+    truth = run.streams.get("truth")
+    if truth is None:
+        return False
+    speed, steer = (
+        np.column_stack([truth.channel(f"{quantity}_{wheel}_{unit}") for wheel in robot.wheels])
+        for quantity, unit in (("wheel", "radps"), ("steer", "rad"))
+    )
+    rolled = rolled_twist(robot, speed * robot.wheel_radius_m, steer)
+    driven = np.hypot(truth.channel("speed_x_mps"), truth.channel("speed_y_mps"))
+    rolled_mps = np.hypot(rolled[:, 0], rolled[:, 1])
+    return bool(driven.sum() < STUCK_RATIO * rolled_mps.sum())
+
+
+def limits_of(run: RunLog, robot: Robot, with_effects: bool, stuck: list[str]) -> tuple[str, ...]:
+    """Return what simulated runs cannot show, a sentence each.
+
+    Parameters
+    ----------
+    run : one of them
+    robot : as it is described
+    with_effects : whether effects were asked for
+    stuck : terrains on which it hardly moved
+    """
+    from terrain.robots import SwerveRobot
+    from terrain.simulation.assumed import with_assumed
+
+    if "wheels" not in run.streams:
+        return ()
+    limits = []
+    if isinstance(robot, SwerveRobot) or not (with_effects or robot.effects or robot.learned):
+        lacks = sorted(with_assumed(robot).parts.keys() - robot.parts.keys())
+        if lacks:
+            limits.append(
+                f"Of robot {robot.name} {enumerated(lacks)} {'are' if len(lacks) > 1 else 'is'} assumed from its "
+                "geometry and mass: terrains differ in vibration and currents as they do for such a robot, by other "
+                "amounts than for yours."
+            )
+    else:
+        limits.append(
+            "With effects, the planar plant is used: it has no vibration of the ground and no load transfer, so "
+            "its runs carry little of the terrain for a classifier."
+        )
+    if not run.streams.keys() & set(REFERENCES):
+        limits.append(
+            "Nothing on board measures the speed over ground, so slip cannot be estimated: add --gnss or --pose, "
+            "or the section 'camera' to the robot's description."
+        )
+    if stuck:
+        limits.append(
+            f"On {enumerated(stuck)} it hardly moves: its wheels spin, and the runs show little but that."
+        )
+    return tuple(limits)
 
 
 def report(result: SimulatedRuns) -> Report:
@@ -123,5 +196,6 @@ def report(result: SimulatedRuns) -> Report:
     return Report(
         f"Simulated runs of {result.robot}",
         f"{plural(result.n_runs, 'run')} {in_all} {result.duration_s:.0f} s, written to {result.out}.",
+        parts=[Text(sentence) for sentence in result.limits],
         next_step=f"terrain inspect {result.out}",
     )

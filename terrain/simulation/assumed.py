@@ -5,8 +5,8 @@ With the mass m, the wheel radius r, the wheelbase L, n wheels that a motor turn
     inertia        a box of the wheelbase and track with the wheels around them, m (l^2 + w^2) / 12; of a wheel and
                    its rotor a tenth of its share of the mass at its radius
     height         r + L / 10 of the centre of mass, in the middle of the contacts
-    tyres          0.6 r wide, a contact as long (a roller's of r / 4), relaxed over half of it; they sag by 0.025 r under
-                   m g / k, with 0.15 of the critical damping
+    tyres          0.6 r wide, a contact as long (a roller's of r / 4), relaxed over half of it; they sag by 0.025 r
+                   under m g / k, with 0.15 of the critical damping
     motors         a torque of m g r / n, which slips every wheel; the top speed of a Froude number v^2 / (g L) of 0.25,
                    that of a brisk walk; 3000 turns a minute there, at 5/6 of no load: k_t = V / w_0, with 24 V, from
                    100 kg on 48 V; a speed loop of 9 rad/s on the share of the mass, integrating over 0.2 s

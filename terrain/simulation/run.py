@@ -274,8 +274,8 @@ def _dynamic(robot: Robot, effects: Mapping[str, float] | None) -> bool:
 def instruments(robot: Robot, gnss: Gnss | None = None, poses: Poses | None = None) -> dict[str, Any]:
     """Return what measures a robot from outside: what is asked for, and what its drive has in the papers of it.
 
-    Tracked robots have cameras around the field, raw fixes and a compass, car-like ones the last two, and robots on omni
-    wheels a camera above.
+    Tracked robots have cameras around the field, raw fixes and a compass, car-like ones the last two, and robots on
+    omni wheels a camera above.
     """
     tracked, car = isinstance(robot, TrackedRobot), isinstance(robot, BicycleRobot)
     if poses is None and (tracked or robot.on_omni_wheels):

@@ -134,9 +134,9 @@ REFUSED = {
         ("file: cannot be written", "--what soil --out file"),
     ],
     "simulate --out runs --terrain grass --scenario straight --robot agrimaro": [
-        ("'course' is for swerve", "--robot husky --terrain course --scenario course"),
-        ("robot husky", "--robot husky --scenario slip"),
-        ("has no receiver", "--robot husky --gnss"),
+        ("driven without eff", "--robot husky --terrain course --scenario course --effect payload=0.1"),
+        ("leave duration, gra", "--robot husky --scenario slip --gnss"),
+        ("with effects no rec", "--robot husky --gnss --effect payload=0.1"),
         ("does not apply to", "--robot husky --effect steering_backlash=0.1"),
         ("effect 'magic' is unknown", "--robot husky --effect magic=1"),
         ("-0.3 to 0.3 is accepted", "--effect wheel_radius=9"),

@@ -133,3 +133,38 @@ def test_commands_that_cannot_be_driven_are_refused(tmp_path, rows, options, say
     (tmp_path / "turn.csv").write_text(COMMANDS + rows)
     with pytest.raises(ConfigError, match=says):
         simulate_runs("husky", "grass", str(tmp_path / "turn.csv"), tmp_path / "out", **options)
+
+
+FOUR = """\
+name: mine
+drive: skid_steer
+wheel_radius_m: {value: 0.165, unit: m, source: mine}
+track_m: {value: 0.57, unit: m, source: mine}
+wheelbase_m: {value: 0.512, unit: m, source: mine}
+mass_kg: {value: 50.0, unit: kg, source: mine}
+"""
+
+
+def test_what_runs_cannot_show_is_stated(tmp_path):
+    (tmp_path / "mine.yaml").write_text(FOUR)
+    mine = str(tmp_path / "mine.yaml")
+
+    def limits(robot, terrain, out, **options):
+        return simulate_runs(robot, terrain, "straight", tmp_path / out, duration_s=6.0, **options).limits
+
+    assumed, blind = limits(mine, "grass", "a")
+    assert assumed.startswith("Of robot mine body, motors and sensors are assumed from its geometry and mass")
+    assert blind.startswith("Nothing on board measures the speed over ground")
+    assert limits(mine, "grass", "b", gnss=True) == limits(mine, "grass", "c", pose=True) == (assumed,)
+    assert limits("husky", "grass", "d") == ()
+    (planar,) = limits("husky", "grass", "e", effect=("payload=0.3",))
+    assert planar.startswith("With effects, the planar plant is used")
+    (stuck,) = limits("robotino", "dry_sand", "f")
+    assert stuck.startswith("On dry_sand it hardly moves")
+
+
+def test_poses_and_satellites_are_on_board_of_every_drive(tmp_path):
+    for robot in ("agrimaro", "husky", "marmotte", "robotino", "omnirobot", "adap2e", "pallet_truck"):
+        simulate_runs(robot, "asphalt", "straight", tmp_path / robot, gnss=True, pose=True)
+        (read,) = find_runs(tmp_path / robot)
+        assert {"gnss", "pose"} <= read().streams.keys()
