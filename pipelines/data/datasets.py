@@ -242,10 +242,12 @@ def verdict(run: RunLog, robot: Robot | None = None) -> tuple[Check, ...]:
     run : as a reader returns it
     robot : that the user named; where the run names another, that of the package
     """
+    from terrain.kinematics.logged_wheels import with_wheel_speeds
     from terrain.robots import robot_named
 
     try:
         known = robot_named(run.robot, robot)
+        run = with_wheel_speeds(run, known) if known.describes("motors") else run
     except ConfigError:
         return judge(run)
     fastest_mps = getattr(known, "speed_max_mps", _wheel_rate_max_radps(known) * known.wheel_radius_m)
@@ -275,13 +277,12 @@ def _motion_of_wheels(run: RunLog, robot: Robot) -> tuple[Stream | None, tuple[f
     """
     import numpy as np
 
-    from terrain.kinematics.logged_wheels import with_wheel_speeds
     from terrain.kinematics.wheels import no_slip_twist, rolled_twist
     from terrain.logs.schema import TWIST
     from terrain.records import Stream
 
     try:
-        wheels = with_wheel_speeds(run, robot).streams["wheels"]
+        wheels = run.streams["wheels"]
         speeds = wheels.columns(f"speed_{wheel}_mps" for wheel in robot.logged_wheels)
         angles = np.zeros((len(wheels), len(robot.wheels)))
         if robot.steered:

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 
 from pipelines.live.chain import COMMAND_VALID_S, Chain, CommandStatus, OnlyWatched, Step
 from pipelines.live.classifying import Classifier
+from pipelines.live.gate import LiveGate
 from pipelines.live.model import TerrainModel
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
@@ -146,6 +147,7 @@ class RobotSession:
     received_s : when its last message came, on the local clock that never goes back
     last : output of the last step; None before the first
     late : that there is no terrain because samples come too late; empty where that is not so
+    gate : what is implausible or doubtful in its samples
 
     Raises
     ------
@@ -172,6 +174,7 @@ class RobotSession:
         if watched is not None and watched.robot.name == hello.robot:
             self.watch = Watch(watched, hello.streams, false_alarm_h, thread)
         self.inbox = Inbox(hello.streams)
+        self.gate = LiveGate(hello.robot, hello.streams, robot, thread)
         pilot = PilotSettings(follows=hello.follows) if hello.control else None
         if pilot is not None and robot is None:
             raise ConfigError(
@@ -232,6 +235,7 @@ class RobotSession:
             "terrain": self.chain.belief.terrain or None,
             "recording": self.recording,
             "late": self.late or None,
+            "doubtful": self.gate.sentences,
             "adapted": self.adapted or None,
             "dropped": self.dropped,
         }
@@ -316,6 +320,7 @@ class RobotSession:
         fresh = now_s - self._twist_s <= TWIST_FRESH_S
         twist = self._twist if fresh else _NO_TWIST
         done = self.chain.take(Sample(time_s, twist, readings))
+        self.gate.step(time_s, readings)
         if self.watch is not None:
             self.watch.step(readings)
         self._n_steps += 1
@@ -370,6 +375,7 @@ class RobotSession:
             "sensors": sensors,
             "served": self.served.number,
             "late": self.late or None,
+            "doubtful": self.gate.sentences,
             "watch": None if self.watch is None else self.watch.content(),
         }
 

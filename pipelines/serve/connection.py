@@ -283,6 +283,12 @@ class Connection:
         self._hub.trouble.pop(f"late samples of {name}", None)
         if late:
             self._hub.trouble[f"late samples of {name}"] = late
+        key, doubts = f"samples of {name}", "; ".join(self._session.gate.sentences)
+        if doubts and doubts != self._hub.trouble.get(key):
+            print(f"{name}: {doubts}", file=sys.stderr, flush=True)
+        self._hub.trouble.pop(key, None)
+        if doubts:
+            self._hub.trouble[key] = doubts
         if (watch := self._session.watch) is not None:
             self._report(name, watch)
         for window in output.windows:

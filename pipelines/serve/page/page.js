@@ -90,6 +90,8 @@
     showTerrain(step, seen);
     showAnswer(message, seen, step.command);
     showWatch(seen.watch);
+    byId("doubtful").hidden = !(seen.doubtful || []).length;
+    text("doubtful", "Samples: " + (seen.doubtful || []).join("; "));
     showTarget(seen);
     showCommand(session, step.command);
     showSensors(seen.sensors);

@@ -7,9 +7,13 @@ import numpy as np
 import pytest
 
 import terrain as face
+from pipelines.live.gate import LiveGate
 from terrain.errors import DoubtfulRunWarning, LogError
+from terrain.logs.replay import replay
 from terrain.logs.run_folders import write_run
 from terrain.records import Stream
+from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
 
 HUSKY = ("--robot", "husky")
 COMMANDS = {
@@ -98,3 +102,18 @@ def test_a_doubt_is_stated_on_the_screen_in_the_result_and_on_the_page(terrain, 
     assert "a tilted sensor, or a steep slope?" in (place / "page.html").read_text()
     with pytest.warns(DoubtfulRunWarning, match="a tilted sensor"):
         face.load_runs(place / "data")
+
+
+def test_samples_of_a_robot_that_is_served_are_judged_while_it_drives_and_nothing_is_refused():
+    """The same sentence as of a log; once a minute is sound it is withdrawn."""
+    run = simulate_run(load_robot("husky"), "grass", "survey", 0, 1, duration_s=110.0)
+    gate = LiveGate("husky", {name: stream.channels for name, stream in run.streams.items()}, None)
+    sentences = []
+    for sample in replay(run, 20.0):
+        readings = dict(sample.readings)
+        if sample.time_s < 18.0 and (imu := readings.get("imu")) is not None:
+            readings["imu"] = imu._replace(values=imu.values / 9.81)
+        gate.step(sample.time_s, readings)
+        sentences += [gate.sentences]
+    assert sentences[0] == sentences[-1] == []
+    assert next(filter(None, sentences))[0].endswith("9.81 is expected: an accelerometer in g read as m/s^2?")
