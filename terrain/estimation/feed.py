@@ -24,9 +24,12 @@ Rows that follow from others
   wheel's circumferential speed w behind two low-passes of 0.15 s, with w_0 = 0.1 m/s: what keeps the ratio of
   a slip speed to w, and what w^2 changes by; without a camera the latter decays within 0.5 s, peaks held;
 - ``camera_age_s``: since the camera last measured a speed;
-- ``rest_speed_*``, ``rest_yaw_rate``: zero, where the robot is at rest: for half a second the wheels have
-  stood, gyro and accelerometer have measured nothing, and a camera, if it measures, no speed.  Locked wheels
-  that slide decelerate the robot: on ice (0.05 of its weight) by more than what counts as nothing.
+- ``ground_slip_ratio``: root mean square of the slip of the wheels over the last seconds of driving with a camera:
+  what slip of this ground is in proportion to when there is none;
+- ``rest_speed_*``, ``rest_yaw_rate``: zero, where the robot is at rest: for a fifth of a second the wheels have
+  stood behind their low-passes, gyro and accelerometer have measured nothing, and a camera, if it measures, no
+  speed.  Locked wheels that slide decelerate the robot: on ice (0.05 of its weight) by more than what counts as
+  nothing.
 
 Of a robot that skids, wheels at 6 Hz leave 15 samples of a gyro at 100 Hz between two ticks.  One of them is
 the yaw rate with all of its vibration; their mean is what the heading changed by.  So the row is the integral
@@ -58,7 +61,7 @@ from terrain.errors import ConfigError, DataError
 from terrain.kernels import filled, inner, njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import QUATERNION_TOLERANCE
-from terrain.kinematics.wheels import no_slip_twist, point_velocity
+from terrain.kinematics.wheels import in_wheel_frame, no_slip_twist, point_velocity
 from terrain.logs.samples import longest_rise
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, STEERING_CHANNELS
 from terrain.records import Array, RunLog, Stream
@@ -94,8 +97,11 @@ MOVING_MPS = 0.05  #: A wheel that turns faster moves, and shakes what is mounte
 #: would drift.
 RIPPLE_MPS = 0.03
 WAVERING_MPS = 0.02  #: By so much the two low-passed speeds of a wheel differ in steady motion.
+#: Slip of a ground before any is measured; driving for so long on another ground, most of it is forgotten; slower, a
+#: wheel does not show it.
+GROUND_SLIP_RATIO, GROUND_S, SHOWN_MPS = 0.2, 5.0, 0.2
 CRAWL_MPS = 0.1  #: w_0: well below it a slip speed no longer follows the speed of its wheel.
-REST_AFTER_S = 0.5  #: Time for which nothing has to move.
+REST_AFTER_S = 0.2  #: Time for which nothing has to move.
 #: What counts as nothing, of a wheel's low-passed speed, the gyro, the accelerometer and the camera: biases and noise
 #: at rest stay below, as does a wheel that is held to and fro on soft ground.
 REST_WHEEL_MPS, REST_TURN_RADPS, REST_ACCEL_MPS2, REST_SEEN_MPS = 0.01, 0.03, 0.4, 0.05
@@ -176,7 +182,7 @@ DERIVED_ROWS = (
     "vibration_mps2",
     *("wheel_1_growth_per_s", "wheel_2_growth_per_s", "wheel_3_growth_per_s"),
     *("wheel_1_change_m2ps3", "wheel_2_change_m2ps3", "wheel_3_change_m2ps3"),
-    *("camera_age_s", "rest_speed_x_mps", "rest_speed_y_mps", "rest_yaw_rate_radps"),
+    *("camera_age_s", "ground_slip_ratio", "rest_speed_x_mps", "rest_speed_y_mps", "rest_yaw_rate_radps"),
 )
 SIDE_ROWS = ("wheel_left_mps", "wheel_right_mps")
 REST_ROW = "rest_gyro_radps"
@@ -199,11 +205,11 @@ ACCEL, GYRO, IMU_YAW, STEER, SEEN, SEEN_TURN, SEEN_YAW, POSITION, TILT = map(
         *("camera_yaw_rate_radps", "camera_yaw_rad", "gnss_position_x_m", "roll_rad"),
     ),
 )
-FIRST_SIGNAL, VIBRATION, GROWTH, CHANGE, SEEN_AGE, REST_TWIST, SIDE, REST_GYRO = map(
+FIRST_SIGNAL, VIBRATION, GROWTH, CHANGE, SEEN_AGE, GROUND_SLIP, REST_TWIST, SIDE, REST_GYRO = map(
     ROWS.index,
     (
         *("accel_x_mps2", "vibration_mps2", "wheel_1_growth_per_s", "wheel_1_change_m2ps3", "camera_age_s"),
-        *("rest_speed_x_mps", "wheel_left_mps", REST_ROW),
+        *("ground_slip_ratio", "rest_speed_x_mps", "wheel_left_mps", REST_ROW),
     ),
 )
 _GYRO, _YAW, _SEEN, _SEEN_YAW = (FIRST_SIGNAL + np.array([GYRO, IMU_YAW, SEEN, SEEN_YAW])).tolist()
@@ -233,6 +239,7 @@ SETTINGS = record(
     {"limits": (LIMIT, len(SIGNALS)), "latency_s": (float, len(STREAMS))}
     | {"is_steered": bool, "is_causal": bool, "is_live": bool}
     | numbers("reduction_ratio fastest_radps wheel_radius_m initial_yaw_rad gyro_bias_radps ema_alpha")
+    | {"wheels_m": (float, (3, 2)), "camera_m": (float, 2)}
     | dict.fromkeys(("steering_zeros_rad", "accel_bias_mps2", "accel_scale_ratio"), (float, 3))
 )
 
@@ -246,7 +253,7 @@ FEED = record(
     {"lines": (LINE, len(SIGNALS)), "turns": (_TURN, 5), "channels": (CHANNEL, REPEATED.size)}
     | {"before": (float, (2, len(CAMERA_CHANNELS))), "camera_yaw_0_rad": float}
     | {"gnss_origin_m": (float, 2), "gnss_variance": float}
-    | numbers("vibration_square vibration_s tick_s rest_since_s camera_s")
+    | numbers("vibration_square vibration_s tick_s rest_since_s camera_s slip_square")
     | dict.fromkeys(("wheel_once_mps", "wheel_twice_mps", "wheel_change_m2ps3"), (float, 3))
     | {"received_s": (float, (2, 3)), "smooth": (float, len(CAMERA_ROWS))}
     | {"start_s": float, "has_moved": bool, "camera_has_started": bool, "camera_offset_rad": float}
@@ -292,6 +299,8 @@ def feed_settings(
         fastest_radps=MAX_RATE_FACTOR * motors.speed_max_radps,
         wheel_radius_m=robot.wheel_radius_m,
         initial_yaw_rad=initial_yaw_rad,
+        wheels_m=np.resize(robot.wheel_positions_m, (3, 2)),
+        camera_m=(camera.lever_x_m, camera.lever_y_m),
         steering_zeros_rad=(*robot.steering_zeros_rad, 0.0, 0.0, 0.0)[:3],
         gyro_bias_radps=sensors.gyro_bias_z_radps,
         accel_bias_mps2=(sensors.accel_bias_x_mps2, sensors.accel_bias_y_mps2, sensors.accel_bias_z_mps2),
@@ -326,7 +335,7 @@ def _limit(time_constant_s: float, period_s: float, tick_s: float, signal: Signa
 def new_feed() -> Array:
     """Return the memory before the first sample."""
     nothing = dict.fromkeys(("camera_offset_rad", "yaw_sum_rad", "gyro_angle_rad", "gyro_time_s"), 0.0)
-    feed = filled(FEED, np.nan, received_s=-np.inf, **nothing)
+    feed = filled(FEED, np.nan, received_s=-np.inf, slip_square=GROUND_SLIP_RATIO**2, **nothing)
     feed["channels"]["repeated"] = feed["channels"]["longest"] = 0.0
     return feed
 
@@ -571,6 +580,22 @@ def _take_wheels(wheels: Array, settings: Any, feed: Any, row: Any) -> None:
 
 
 @_inner
+def _measure_slip(step_s: float, settings: Any, feed: Any, row: Any) -> None:
+    """Write the slip of the ground, from wheels, camera and gyro."""
+    turn = row[_GYRO]
+    x, y = point_velocity(row[_SEEN], row[_SEEN + 1], turn, -settings.camera_m[0], -settings.camera_m[1])
+    for i in range(3):
+        forward, left = point_velocity(x, y, turn, settings.wheels_m[i, 0], settings.wheels_m[i, 1])
+        steer, speed = row[FIRST_SIGNAL + STEER + i], row[i] * settings.wheel_radius_m
+        along, _ = in_wheel_frame(forward, left, math.cos(steer), math.sin(steer))
+        fastest = max(abs(speed), abs(along))
+        if fastest > SHOWN_MPS and step_s > 0.0 and not math.isnan(speed - along):
+            square = ((speed - along) / fastest) ** 2
+            feed.slip_square += (square - feed.slip_square) * -math.expm1(-step_s / (3.0 * GROUND_S))
+    row[GROUND_SLIP] = math.sqrt(feed.slip_square)
+
+
+@_inner
 def _derive(time_s: float, settings: Any, feed: Any, row: Any) -> None:
     """Write the rows that follow from others."""
     step_s = time_s - feed.tick_s
@@ -606,6 +631,7 @@ def _derive(time_s: float, settings: Any, feed: Any, row: Any) -> None:
         feed.rest_since_s = np.nan
     elif math.isnan(feed.rest_since_s):
         feed.rest_since_s = time_s
+    _measure_slip(step_s, settings, feed, row)
     if time_s - feed.rest_since_s >= REST_AFTER_S:
         row[REST_TWIST : REST_TWIST + 3] = 0.0
         for i in range(2):  # at rest a camera that measures none is right again

@@ -72,6 +72,7 @@ from terrain.estimation.feed import (
     CHANGE,
     DERIVED_ROWS,
     GNSS_ROWS,
+    GROUND_SLIP,
     GROWTH,
     ROWS,
     SEEN_AGE,
@@ -103,7 +104,7 @@ _STATES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("accel_x_mps2", "accel_y_mps2"), (1.0, 2.0)),
     **dict.fromkeys(_STEER_ROWS, (0.3, 0.1)),
     "gyro_bias_radps": (0.01, 2e-4),
-    **dict.fromkeys(("slip_speed_1_mps", "slip_speed_2_mps", "slip_speed_3_mps"), (0.2, 0.03)),
+    **dict.fromkeys(("slip_speed_1_mps", "slip_speed_2_mps", "slip_speed_3_mps"), (0.2, 0.005)),
     "imu_yaw_offset_rad": (0.01, 3.5e-4),
     **dict.fromkeys(("accel_bias_x_mps2", "accel_bias_y_mps2"), (0.05, 2e-3)),
 }
@@ -324,6 +325,7 @@ def make_filter(name: str, robot: Robot, with_gnss: bool = False, thesis: bool =
     if thesis:
         r, q, p0 = _THESIS[has_camera]
         process[: len(q)] = np.array(q) / THESIS_SAMPLE_TIME_S
+        process[_SLIP:_OFFSET] = SLIP_MPS**2
         variance[: len(r)], initial[: len(p0)] = r, p0
     return FilterModel(
         name=f"{name} with GNSS" if with_gnss else name,
@@ -357,7 +359,8 @@ def make_filter(name: str, robot: Robot, with_gnss: bool = False, thesis: bool =
 
 # Places of the derived rows among those of the feed, which all tables of a swerve robot begin with.
 _GROWTHS, _CHANGES = slice(GROWTH, GROWTH + 3), slice(CHANGE, CHANGE + 3)
-SHAKEN_S, CHANGED_RATIO, UNSEEN_RATIO, SHAKEN_TURN_S, SHAKEN_ACCEL_RATIO = 0.09, 0.4, 1.0 / 3.0, 0.02, 0.5
+SHAKEN_S, CHANGED_RATIO, SHAKEN_TURN_S, SHAKEN_ACCEL_RATIO = 0.09, 0.4, 0.02, 0.5
+SLIP_MPS, STARTED_RATIO, STARTED_SLIPS, VARIED_SLIPS = 0.03, 0.15, 2.5, 0.5
 
 
 def scheduled(
@@ -371,12 +374,17 @@ def scheduled(
     which shows as a change of the wheel's speed w.  The latter is written so that a start from rest leaves a
     slip ratio of 0 +- 0.4, fast or slow: slip speeds walk by, in a second::
 
-        q = (0.09 s a_z)^2 + 0.4^2 |d(w^2)/dt|
+        q = (0.03 m/s)^2 + (0.09 s a_z)^2 + 0.4^2 |d(w^2)/dt|
+
+    What vibration does to slip goes back and forth: it leads nowhere over seconds without a camera.  There slip
+    is what it was on this ground, s (the row ``ground_slip_ratio``), and varies in proportion to it, on tiles by
+    thousandths, on loam by tenths, as the ground, its slope and the thrust do::
+
+        q = (0.5 s w)^2 + (0.15^2 + (2.5 s)^2) |d(w^2)/dt|
 
     Rough ground, and wheels that change their speed while they are still being steered, turn the robot, too:
     the yaw rate walks by the mean of ``(0.02 s a_z)^2 + 0.4^2 |d(w^2)/dt|`` over the squared distance of a
-    wheel from the origin.  What vibration does to slip goes back and forth: it leads nowhere over seconds
-    without a camera, and there 0.03 s stands for 0.09 s.
+    wheel from the origin.
 
     An accelerometer has ``R = R_quiet + (0.5 a_z)^2``; as on rough ground where the vibration is unknown.
 
@@ -397,9 +405,12 @@ def scheduled(
     vibration = np.where(np.isnan(z[:, [VIBRATION]]), UNKNOWN_MPS2, shaken)
     variance[:, 3:5] += (SHAKEN_ACCEL_RATIO * vibration) ** 2
     unseen = ~(z[:, [SEEN_AGE]] <= UNSEEN_AFTER_S)
-    shaken_s = SHAKEN_S * (1.0 - (1.0 - UNSEEN_RATIO) * unseen)
+    slip = known[:, [GROUND_SLIP]]
+    by_ground = (VARIED_SLIPS * slip * model.params[_RADIUS] * known[:, :3]) ** 2
+    varied = np.where(unseen, by_ground, SLIP_MPS**2 + (SHAKEN_S * shaken) ** 2)
+    ratio = np.where(unseen, np.hypot(STARTED_RATIO, STARTED_SLIPS * slip), CHANGED_RATIO)
     walk = np.zeros((len(z), len(model.states)))
-    walk[:, _SLIP:_OFFSET] = (shaken_s * shaken) ** 2 + 2.0 * CHANGED_RATIO**2 * changed
+    walk[:, _SLIP:_OFFSET] = varied + 2.0 * ratio**2 * changed
     changes = changed[:, 0] + changed[:, 1] + changed[:, 2]
     turned = 3.0 * (SHAKEN_TURN_S * shaken[:, 0]) ** 2 + 2.0 * CHANGED_RATIO**2 * changes
     walk[:, _W] = turned / float((model.params[_PLACES:_CAMERA_X] ** 2).sum())

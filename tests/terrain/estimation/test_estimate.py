@@ -88,7 +88,7 @@ def test_a_camera_outage_of_3_s_makes_slip_stale_and_less_certain_but_close(seed
     true = np.mean(
         [np.interp(time_s, truth.time_s, truth.channel(f"slip_{i}_ratio")) for i in (1, 2, 3)], axis=0
     )
-    assert found.slip.slip_ratio[lost].mean() == pytest.approx(true[lost].mean(), abs=0.01)
+    assert found.slip.slip_ratio[lost].mean() == pytest.approx(true[lost].mean(), abs=0.015)
     std = found.slip.slip_std.mean(axis=1)
     assert std[lost][-1] > 2 * std[(time_s > 9.0) & (time_s < 10.0)].max()
     assert (np.diff(std[lost][::25]) > 0).all()

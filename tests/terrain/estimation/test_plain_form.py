@@ -116,6 +116,20 @@ def plain_moving(clock, wheel_speed_mps):
     return once, twice, moving
 
 
+def plain_slips(table, speeds, robot):
+    """Return the slip (n, 3) of each wheel by the camera; NaN where it is slow or not measured."""
+    turn, camera = table["gyro_z_radps"], robot.camera
+    x = table["camera_speed_x_mps"] + turn * camera.lever_y_m
+    y = table["camera_speed_y_mps"] - turn * camera.lever_x_m
+    steer = np.column_stack([table[f"steer_{i}_rad"] for i in (1, 2, 3)])
+    x_m, y_m = robot.wheel_positions_m.T
+    along = (x[:, None] - turn[:, None] * y_m) * np.cos(steer) + (y[:, None] + turn[:, None] * x_m) * np.sin(
+        steer
+    )
+    fastest = np.maximum(np.abs(speeds), np.abs(along))
+    return np.where(fastest > feed.SHOWN_MPS, (speeds - along) / fastest, np.nan)
+
+
 def plain_derived(clock, table, once, twice, imu_s, accel_z, robot):
     """Return the rows that follow from others, tick by tick."""
     n = clock.size
@@ -126,6 +140,7 @@ def plain_derived(clock, table, once, twice, imu_s, accel_z, robot):
         keep = np.exp(-(imu_s[k] - imu_s[before[-1]]) / feed.VIBRATION_S) if before.size else 0.0
         square[k] = accel_z[k] ** 2 + ((square[before[-1]] - accel_z[k] ** 2) * keep if before.size else 0.0)
     speeds = np.column_stack([table[f"wheel_{i}_radps"] for i in (1, 2, 3)]) * robot.wheel_radius_m
+    slips, ground = plain_slips(table, speeds, robot), feed.GROUND_SLIP_RATIO**2
     still_since, seen_s, changes = np.nan, np.nan, np.full((n, 3), np.nan)
     for k in range(n):
         for i in range(3):
@@ -144,6 +159,11 @@ def plain_derived(clock, table, once, twice, imu_s, accel_z, robot):
                 rows[f"wheel_{i + 1}_change_m2ps3"][k] = (
                     np.nanmax(left) if np.isfinite(left).any() else np.nan
                 )
+        if k:
+            for ratio in slips[k][np.isfinite(slips[k])]:
+                keep = np.exp(-(clock[k] - clock[k - 1]) / (3 * feed.GROUND_S))
+                ground = ratio**2 + (ground - ratio**2) * keep
+        rows["ground_slip_ratio"][k] = np.sqrt(ground)
         still = k > 0 and (np.abs(twice[k - 1]) <= feed.REST_WHEEL_MPS).all()
         still &= (np.abs(speeds[k]) <= feed.MOVING_MPS).all() and abs(
             table["gyro_z_radps"][k]
@@ -249,7 +269,7 @@ def plain_yaw(table, clock, wheel_speed_mps, initial_yaw_rad, causal):
 
 
 def plain_table(run, robot, causal, initial_yaw_rad):
-    """Return rows (n, 29), variances (n, 4) and counts of jumps of a swerve robot's run."""
+    """Return rows (n, 30), variances (n, 4) and counts of jumps of a swerve robot's run."""
     streams, lag_s = clean_streams(run, robot)[0], robot.sensors.encoder_time_constant_s
     wheels = streams["wheels"]
     clock, rates = wheels.time_s, wheels.values / robot.motors.reduction_ratio

@@ -143,7 +143,7 @@ def test_samples_that_are_no_numbers_are_left_out_and_counted():
     table, plain = measurement_table(run, bare()), measurement_table(RUN, bare())
     assert table.dropped == {"imu: not finite": 3, "odometry: not finite": 199, "wheels: not finite": 1}
     changed = np.array(table.rows)[~np.isclose(table.z, plain.z, rtol=0, atol=0, equal_nan=True).all(axis=0)]
-    others = {"gyro_z_radps", "wheel_2_radps", "wheel_2_change_m2ps3", "camera_age_s"}
+    others = {"gyro_z_radps", "wheel_2_radps", "wheel_2_change_m2ps3", "camera_age_s", "ground_slip_ratio"}
     assert set(changed) == {*others, *CAMERA_ROWS}
     assert np.flatnonzero(np.isnan(table.columns(["wheel_2_radps"])[:, 0])).tolist() == [7]
     assert np.isfinite(table.columns(["gyro_z_radps"])).all()  # held over the two

@@ -8,7 +8,7 @@ from model_draws import sample_from_model
 from scipy.stats import chi2
 
 from terrain.errors import ConfigError
-from terrain.estimation.consistency import nees
+from terrain.estimation.consistency import lagged_slip_at, nees
 from terrain.estimation.estimate import estimate_run
 from terrain.estimation.feed import DERIVED_ROWS, REST_AFTER_S, measurement_table
 from terrain.estimation.filter import GATE_PROBABILITY, HELD_S, REOPEN_AFTER_S, FilterSettings, run_filter
@@ -17,7 +17,8 @@ from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import GATED, REOPENED, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
-from terrain.simulation.scenario import Faults
+from terrain.simulation.scenario import Faults, from_commands
+from terrain.terramechanics.soil import soil_names
 
 ROBOT = load_robot("agrimaro")
 VIO15 = make_filter("vio15", ROBOT)
@@ -193,6 +194,33 @@ def test_a_robot_at_rest_keeps_its_position_without_a_camera_and_locked_wheels_t
     assert rest[(time_s > 3.0) & (time_s < 4.0)].all()
     assert not rest[(time_s > 4.2) & (time_s < 8.0 + 0.8 * REST_AFTER_S)].any()
     assert rest[time_s > 9.5].all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("terrain", soil_names())
+def test_errors_are_those_stated_in_runs_of_a_minute_and_in_starts_long_after_the_camera_was_lost(terrain):
+    """A start in any direction after ten seconds without a camera, driving on or slowing down, and a short stop."""
+    squares, inside = {"yaw_rad": [], "gyro_bias_radps": []}, []
+    for number in range(1, 13):
+        found = estimate_run(simulate_run(ROBOT, terrain, "complex", 2900, number, vary=True), ROBOT, "vio15")
+        for state, each in squares.items():
+            each.append(np.nanmean(nees(found.track, found.truth, [state])))
+        rng = np.random.default_rng(2900 + number)
+        ends, first = np.cumsum([1.0, 1.5, 7.0, 10.0, 1.5, 1.0, 1.5, 5.0]), rng.uniform(-np.pi, np.pi)
+        x, y = np.exp(1j * np.array([first, rng.uniform(-np.pi, np.pi)])).view(float).reshape(2, 2)
+        then = np.zeros(2) if number % 2 else x
+        twist = [np.zeros(2), x, x, then, np.zeros(2), np.zeros(2), y, y]
+        commands = np.column_stack([[0.0, *ends], np.vstack([np.zeros(2), twist]), np.zeros(9)])
+        drive = from_commands("restart", ROBOT, terrain, commands)
+        lost = Faults(camera_lost_s=((ends[2], ends[-1]),), by_chance=False)
+        run = simulate_run(ROBOT, terrain, drive, 2900, number, vary=True, faults=lost)
+        slip = estimate_run(run, ROBOT, "vio15").slip
+        error = np.abs(slip.slip_ratio - lagged_slip_at(run, ROBOT, slip.time_s))[slip.time_s > ends[5]]
+        known = np.isfinite(error)
+        inside.append((error < 1.96 * slip.slip_std[slip.time_s > ends[5]])[known].mean())
+    for each in squares.values():
+        assert 0.5 < np.mean(each) < 2.0
+    assert 0.9 < np.mean(inside) < 0.995
 
 
 def test_the_offset_of_the_imus_yaw_follows_its_drift_and_the_yaw_stays():
