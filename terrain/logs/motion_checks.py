@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from terrain.constants import GRAVITY_MPS2
 from terrain.logs.schema import TWIST
 from terrain.records import Array, RunLog, Stream
 from terrain.signals import agreement
@@ -44,12 +45,14 @@ LEAST_OF_WHEELS = 0.3
 IMPLAUSIBLE_OF_WHEELS = 1.0 / 30.0
 #: Part of the power of the velocity along the body's x axis, of a robot that cannot drive sideways.
 MIN_AHEAD = (0.5, 0.1)
-STILL_M = 5e-4  #: No receiver's positions stay within this for seconds.
+STILL_M = 5e-4  #: No receiver's positions stay within this for seconds, the robot's being stuck or not.
+MIN_DRIVEN_M = 2.0
 STEERING_RATE_RADPS = 20.0  #: No steering is faster.
 MAX_STD_OF_FIX_M = 1.0
 #: Part of the speeds of steered wheels that no twist explains, from which, and over that of turned angles beyond which,
 #: the sign of the steering is turned: sound wheels that slip contradict each other by 0.02.
 CONTRADICTION, OVER_TURNED = 0.05, 3.0
+MIN_ACCELERATION_MPS2 = 0.15
 MIN_TILT_RAD = 0.02  #: Less is that of a floor, and of offsets.
 MIN_CERTAIN_POINTS = (
     50  #: A run of 10 s; of a shorter one, noise and a shift of clocks may look like a mistake
@@ -125,8 +128,9 @@ def motion_findings(run: RunLog, robot: Described) -> list[Finding]:
         *_yaw_rates(sources, robot),
         *_directions(sources, robot),
         *_still_positions(run, sources),
+        *_acceleration(run, robot, grid_s),
         *_attitude(run, grid_s),
-        *_steering(run, robot),
+        *_steering(run, robot, grid_s),
         *_receiver(run),
         *_currents(run, robot),
     ]
@@ -455,26 +459,19 @@ def _directions(sources: Sequence[Seen], robot: Described) -> list[Finding]:
 
 
 def _still_positions(run: RunLog, sources: Sequence[Seen]) -> list[Finding]:
-    """Return streams whose positions hardly move while the wheels drive for metres: degrees."""
+    """Return whether positions of a receiver hardly move while the wheels drive for metres: degrees."""
     wheels = next((seen.velocity_mps for seen in sources if seen.name == WHEELS), None)
-    if wheels is None or not np.isfinite(wheels).any():
+    gnss = run.streams.get("gnss")
+    if wheels is None or gnss is None or not set(POSITIONS) <= set(gnss.channels):
         return []
     driven_m = float(np.nansum(np.hypot(*wheels.T)) * STEP_S)
-    found = []
-    for name in ("gnss", "pose"):
-        stream = run.streams.get(name)
-        if stream is None or not set(POSITIONS) <= set(stream.channels) or driven_m < 2.0:
-            continue
-        spread_m = float(
-            np.nanmax(
-                np.ptp(stream.columns(POSITIONS)[np.isfinite(stream.columns(POSITIONS)).all(axis=1)], axis=0),
-                initial=0.0,
-            )
-        )
-        if 0.0 < spread_m < STILL_M:
-            odd = f"position: {name} stays within {spread_m:.2g} m while the wheels drive {driven_m:.3g} m: in degrees?"
-            found.append(Finding("position", 2, name, spread_m, odd))
-    return found
+    positions = gnss.columns(POSITIONS)
+    positions = positions[np.isfinite(positions).all(axis=1)]
+    spread_m = float(np.ptp(positions, axis=0).max()) if len(positions) else 0.0
+    if driven_m < MIN_DRIVEN_M or not 0.0 < spread_m < STILL_M:
+        return []
+    odd = f"position: gnss stays within {spread_m:.2g} m while the wheels drive {driven_m:.3g} m: in degrees?"
+    return [Finding("position", 2, "gnss", spread_m, odd)]
 
 
 # -- Sensors by themselves ------------------------------------------------------------------------------------
@@ -483,6 +480,34 @@ def _still_positions(run: RunLog, sources: Sequence[Seen]) -> list[Finding]:
 def _quantile(values: Array, part: float = 0.99) -> float:
     known = np.abs(values[np.isfinite(values)])
     return float(np.quantile(known, part)) if known.size else math.nan
+
+
+def _acceleration(run: RunLog, robot: Described, grid_s: Array) -> list[Finding]:
+    """Compare the specific force ahead with the acceleration of the wheels; slopes add to it: at most doubtful."""
+    imu = run.streams.get("imu")
+    if robot.twist is None or imu is None or "accel_x_mps2" not in imu.channels:
+        return []
+    speed_mps = robot.twist.channel(TWIST[0])
+    wheels = _change(robot.twist.time_s, speed_mps, grid_s, of_rate=False)
+    by = _compare_changes(_change(imu.time_s, imu.channel("accel_x_mps2"), grid_s, of_rate=True), wheels)
+    if not by.is_known or by.least < MIN_ACCELERATION_MPS2:
+        return []
+    of = f"acceleration: accel_x is {math.copysign(by.ratio, by.cosine):.3g} times the acceleration of the wheels"
+    if by.cosine < 0.0:
+        return [Finding("acceleration", 1, "imu", -by.ratio, f"{of}: a turned x axis of the IMU?")]
+    if by.ratio < LEAST_OF_WHEELS:
+        return [Finding("acceleration", 1, "imu", by.ratio, f"{of}: wheels in km/h or rad/s read as m/s?")]
+    return [Finding("acceleration", 0, "imu", by.ratio, of)]
+
+
+def _compare_changes(measured: Array, reference: Array) -> Likeness:
+    """Compare two signals (n,) about their means: an offset, or a mounting askew, is no turned sign."""
+    both = np.isfinite(measured) & np.isfinite(reference)
+    if both.sum() < MIN_CERTAIN_POINTS:
+        return Likeness()
+    return _compare(
+        *(np.where(both, each - each[both].mean(), np.nan)[:, None] for each in (measured, reference))
+    )
 
 
 def _attitude(run: RunLog, grid_s: Array) -> list[Finding]:
@@ -499,11 +524,11 @@ def _attitude(run: RunLog, grid_s: Array) -> list[Finding]:
             continue
         if f"accel_{axis}_mps2" not in imu.channels:
             continue
-        force = _change(imu.time_s, imu.channel(f"accel_{axis}_mps2"), grid_s, of_rate=True) / 9.81
+        force = _change(imu.time_s, imu.channel(f"accel_{axis}_mps2"), grid_s, of_rate=True) / GRAVITY_MPS2
         angle = sign * _change(imu.time_s, imu.channel(name), grid_s, of_rate=True)
-        by = _compare(angle[:, None], force[:, None])
+        by = _compare_changes(angle, force)
         like, ratio = by.cosine, by.ratio
-        if abs(like) < MIN_LIKENESS or by.least * max(ratio, 1.0 / ratio) < MIN_TILT_RAD:
+        if not by.is_known or by.least < MIN_TILT_RAD:
             continue
         of = f"attitude: {name} of imu is {math.copysign(ratio, like):.3g} times the tilt that gravity shows"
         if like < 0.0:
@@ -519,7 +544,7 @@ def _attitude(run: RunLog, grid_s: Array) -> list[Finding]:
     return found
 
 
-def _steering(run: RunLog, robot: Described) -> list[Finding]:
+def _steering(run: RunLog, robot: Described, grid_s: Array) -> list[Finding]:
     stream = run.streams.get("steering")
     if stream is None or len(stream) < MIN_POINTS:
         return []
@@ -531,19 +556,19 @@ def _steering(run: RunLog, robot: Described) -> list[Finding]:
             f"{100 * turned:.0f} % with angles of the other sign: a turned sign of the steering?"
         )
         found.append(Finding("steering", _level(len(stream), True, True), "steering", given, odd))
-    fastest = (
-        5.0 * robot.steering_rate_max_radps if robot.steering_rate_max_radps > 0.0 else STEERING_RATE_RADPS
-    )
+    known = robot.steering_rate_max_radps > 0.0
+    fastest = max(3.0 * robot.steering_rate_max_radps, 2.0) if known else STEERING_RATE_RADPS
     for channel in stream.channels:
         if not channel.startswith("angle_"):
             continue
         angle = stream.channel(channel)
-        rate, largest = _quantile(np.diff(angle) / np.diff(stream.time_s), 0.995), _quantile(angle)
+        rate = _quantile(_change(stream.time_s, angle, grid_s, of_rate=False), 0.995)
+        largest = _quantile(angle)
         steepest = 1.1 * np.pi if robot.front_driven else 0.55 * np.pi
         if robot.sideways is False and largest > steepest:
             odd = f"steering: {channel} reaches {largest:.3g} rad, {steepest:.3g} is the most: in degrees?"
             found.append(Finding("steering", 2, channel, largest, odd))
-        elif rate > max(fastest, 3.0):
+        elif rate > fastest:
             odd = (
                 f"steering: {channel} turns by up to {rate:.3g} rad/s, {fastest:.3g} is the most: in degrees?"
             )
