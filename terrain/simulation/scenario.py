@@ -40,7 +40,7 @@ SLIP_MARGIN = 1.25
 YAW_RATE_RADPS = 0.3  # of ``arc`` and the curves of ``complex``
 CIRCLE_M, CIRCLE_MPS = 1.5, 0.5  # radius of ``circle``, and its speed unless a lower one is given
 BRAKE_S = 4.0  # of ``brake``: how long the speed is held before the stop, and the rest after it
-LONGEST_S = 3600.0  # a run is held whole in memory, step by step: an hour is a gigabyte and a half
+LONGEST_S = 3600.0  # a run is held whole in memory, step by step: an hour is two gigabytes
 _RAMPED = ("straight", "climb", "starts")  # those whose acceleration can be chosen
 # Speed where none is given, and the share of its fastest speed that a slower or car-like robot drives.
 CRUISING_MPS, CRUISING_SHARE = 1.0, 1.0 / 3.0
@@ -485,7 +485,7 @@ class Conditions:
     grade_ratio: tuple[float, float] = (0.0, 0.0)
     undulation_ratio: float = 0.0  # a gradient along world x that changes along the path; its wave length
     undulation_length_m: float = 15.0
-    # (3,) true rolling radius of each wheel over the nominal one
+    # (3,) true rolling radius of each of the first wheels over the nominal one; a fourth has the nominal one
     radius_factors: tuple[float, float, float] = (1.0, 1.0, 1.0)
     roughness_factor: float = 1.0  # roughness over that of the soil's description
     field_length_m: float = 0.5  # over which length the terrain changes along the path

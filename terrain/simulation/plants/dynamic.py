@@ -1,6 +1,11 @@
-"""The dynamic plant: a swerve robot with load transfer on three driven, steered wheels, in open loop or controlled.
+"""The dynamic plant: a robot of any drive, with load transfer on its contacts, in open loop or controlled.
 
-Effects of the robot (:mod:`terrain.effects`) act where a real robot would have them:
+A robot has wheels as its description has them, each with a motor or rolling freely, and contacts that they turn
+(:mod:`terrain.simulation.contacts`): the two tyres of a side of a skid-steer robot turn at one rate, as do the patches
+of a track, which are strips of it that together sink and shear as the whole; the two tyres of an axle of a car share
+its torque and differ in rate by a differential, or roll freely, and those of a steered axle roll about one centre.
+
+Effects of a swerve robot (:mod:`terrain.effects`) act where a real robot would have them:
 
 - **wheel_radius, one_sided_radius**: true radii of the wheels, of which the commands know nothing;
 - **steering_delay, steering_gain, steering_lag, steering_backlash, steering_offset_i**: between the encoder, which the
@@ -32,16 +37,17 @@ deflection with the distance rolled only widens this.  Beyond the limit a wheel'
 step and grows until the contact slides.  Its force then jumps between the friction limits of the load, which for a
 large mass exceed what the motors can give by orders of magnitude.
 
-Three contacts share the body: the largest eigenvalue of all of them together is at most the largest of the wheels' own
-plus the trace of the body's, ``sum K_i (2 / m + rho_i^2 / I_z)``, with rho_i the distance of a wheel from the centre of
-mass.  A tyre as a spring k_t with a damper c under a corner of mass m_i is stepped alike, and is stable where
-``dt^2 k_t + 2 dt c < 4 m_i``.
+The contacts share the body: the largest eigenvalue of all of them together is at most the largest of the wheels' own
+(of a wheel with several contacts ``sum K_i r^2 / I``) plus the trace of the body's, ``sum K_i (2 / m + rho_i^2 /
+I_z)``, with rho_i the distance of a wheel from the centre of mass.  A tyre as a spring k_t with a damper c under a
+corner of mass m_i is stepped alike, and is stable where ``dt^2 k_t + 2 dt c < 4 m_i``.
 
 States are integrated with semi-implicit steps of :data:`STEP_S`.  What acts, in the order of one step:
 
-- **load**: three contacts carry a rigid body, so their normal forces follow from balance alone:
-  ``sum N = m g cos``, and the moments of gravity and inertia about the two body axes; tyres as springs over
-  a rough ground add their own.
+- **load**: contacts carry a rigid body: ``sum N = m g cos``, and the moments of gravity and inertia about the two body
+  axes.  Of three contacts the normal forces follow from balance alone; more are springs of one stiffness each under a
+  rigid body, so that theirs are the least squares of the balance.  Tyres as springs over a rough ground add their own;
+  height, roll and pitch of the ride are those of the plane of least squares through the corners.
 - **steering**: a rate-limited, acceleration-limited motor turns the wheel through a backlash of half width
   ``dead_band``.
 - **speed loop** of each motor driver: PI on its own estimate of the wheel's rate, torque limit with
@@ -50,7 +56,14 @@ States are integrated with semi-implicit steps of :data:`STEP_S`.  What acts, in
   single contact point) with the larger absolute speed as in the SAE slip,
   ``du/dt = (w r - v_long) - max(|w r|, |v_long|) u / sigma``, so that ``u / sigma`` settles at the slip
   ratio and stays finite at rest; ``terrain.terramechanics`` turns deflection and load into thrust, side force
-  and resistance.
+  and resistance.  Where wheels are not steered, contacts skid: there the speed of the contact in any direction takes
+  the place of that along the wheel, so that the force opposes the sliding whatever its direction.
+- **rollers** of omni and mecanum wheels hold the ground along their axis alone, at the angle g to the direction d that
+  the wheel drives along: ``du/dt = w r cos g - v_axis - max(|w r|, |v|) u / sigma``.  Across it they turn with
+  ``v_across + w r sin g``, against a friction of ``roller_friction_ratio`` of the load times that speed over the
+  larger of wheel speed and speed over ground.
+- **differential**: with the inertia I of an axle, ``I dw/dt = T - r (F_l + F_r)`` for the mean rate w, and
+  ``I dq/dt = r (F_l - F_r)`` for half the difference q of the rates of its tyres; T is 0 without a motor.
 - **leg**: the third wheel's leg swings about a hinge on the line of the other two, within
   ``leg_backlash_rad``, to where the ground pushes its wheel; that turns the wheel's heading, which
   its steering encoder below the hinge does not see (thesis, conclusions: backlash of the third leg's opening
