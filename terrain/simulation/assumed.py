@@ -13,7 +13,8 @@ With the mass m, the wheel radius r, the wheelbase L, n wheels that a motor turn
     steering       2 rad/s, of a car-like robot as it is described
     sensors        those of a common MEMS unit and of encoders on the motors
 
-The described robots of the package (0.04 to 0.2 m, 12 to 90 kg) are within a factor of about two of all these.
+Of the described robots of the package (0.04 to 0.2 m, 12 to 90 kg) inertia, tyres, torque, top speed and the torque of
+an ampere are within a factor of two of these, dampers, friction and the inertia of wheels within three.
 """
 
 from __future__ import annotations
@@ -28,19 +29,13 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.robots import KIND_OF_SECTION, BicycleRobot, Robot, TrackedRobot
 from terrain.simulation.contacts import TRACK_PATCHES, contacts_of
 
-SECTIONS = (
-    "body",
-    "motors",
-    "steering",
-    "sensors",
-)  # that a simulation needs; a camera is on board or is not
+# That a simulation needs; a camera is on board or is not.
+SECTIONS = ("body", "motors", "steering", "sensors")
 SAG_RATIO, DAMPING_RATIO, FROUDE = 0.025, 0.15, 0.25
 ROTOR_SHARE, MOTOR_RADPS, NO_LOAD_RATIO, HEAVY_KG = 0.1, 314.0, 1.2, 100.0
 BANDWIDTH_RADPS, INTEGRAL_S = 9.0, 0.2
-FRICTION_RATIO, CURRENT_STD_RATIO = (
-    0.03,
-    0.005,
-)  # of motors and reductions, noise of a current: over the largest
+# Friction of motors and reductions over the largest torque, and noise of a current over the largest.
+FRICTION_RATIO, CURRENT_STD_RATIO = 0.025, 0.005
 
 _INSTRUMENTS = {
     "wheels_rate_hz": 50.0,

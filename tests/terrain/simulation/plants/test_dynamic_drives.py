@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.files.names import packaged
 from terrain.kinematics.commands import wheel_motion
@@ -46,6 +47,18 @@ SWERVE = load_robot("agrimaro")
 ROBOTS = [SKID, TRACKED, OMNI, MECANUM, CAR, TRICYCLE, SWERVE]
 SYMMETRIC = [robot for robot in ROBOTS if robot is not SWERVE]
 EVEN = {name: dataclasses.replace(load_soil(name), scatter=()) for name in ("grass", "asphalt", "clay")}
+LINEAR = Soil(
+    "linear",
+    "magic",
+    0.0,
+    0.0,
+    0.0,
+    stiffness_ratio=1.0,
+    shape_ratio=1.2,
+    peak_friction_ratio=0.9,
+    curvature_ratio=0.0,
+    roller_friction_ratio=0.2,
+)
 SMOOTH = Conditions(roughness_factor=0.0)
 
 of_drives = pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.drive)
@@ -142,6 +155,32 @@ def test_steady_slip_is_that_of_the_law_of_the_soil_for_load_and_resistance(robo
     assert pulled == pytest.approx(resisting, rel=0.02)
 
 
+@of_drives
+def test_vibration_grows_with_roughness_and_current_with_resistance(robot):
+    conditions = (Conditions(roughness_factor=factor) for factor in (1.0, 4.0))
+    smooth, rough = (
+        drive(robot, (0.4, 0.0, 0.0), 4.0, conditions=each).streams["imu"] for each in conditions
+    )
+    at_rest, *shaken = (
+        part.channel("accel_z_mps2")[where].var()
+        for part, where in ((smooth, slice(80)), (smooth, slice(200, None)), (rough, slice(200, None)))
+    )
+    ratio = math.sqrt((shaken[1] - at_rest) / (shaken[0] - at_rest))
+    assert ratio == pytest.approx(2.0, rel=0.2)  # as the root of the roughness
+    currents = []
+    for resistance in (0.02, 0.06):
+        soil = dataclasses.replace(LINEAR, rolling_resistance_ratio=resistance, roller_friction_ratio=0.0)
+        wheels = drive(robot, (0.4, 0.0, 0.0), 6.0, soil=soil).streams["wheels"]
+        names = [f"current_{wheel}_a" for wheel in robot.logged_wheels]
+        currents.append(sum(abs(wheels.channel(name)[-100:].mean()) for name in names))
+    more_n = 0.04 * robot.mass_kg * GRAVITY_MPS2
+    if robot.on_omni_wheels:  # whose wheels pull askew
+        assert currents[1] > currents[0]
+    else:
+        more_a = more_n * robot.wheel_radius_m / with_assumed(robot).motors.nm_per_a
+        assert currents[1] - currents[0] == pytest.approx(more_a, rel=0.1)
+
+
 def test_a_skid_steer_robot_turns_slower_than_its_wheels_say():
     husky = load_robot("husky")
     run = drive(husky, (0.4, 0.0, 0.6), soil="grass")
@@ -158,20 +197,6 @@ def test_what_drives_sideways_does(robot):
         pytest.approx(0.2, rel=0.03),
         pytest.approx(0, abs=0.02),
     )
-
-
-LINEAR = Soil(
-    "linear",
-    "magic",
-    0.0,
-    0.0,
-    0.0,
-    stiffness_ratio=1.0,
-    shape_ratio=1.2,
-    peak_friction_ratio=0.9,
-    curvature_ratio=0.0,
-    roller_friction_ratio=0.2,
-)
 
 
 @pytest.mark.parametrize(
