@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import chain
 from operator import attrgetter
@@ -135,9 +135,14 @@ def load_runs(folder: str | Path, *, robot: str | Path | None = None, **reading:
     found = read(AlignedRunsSettings(data=Path(folder), robot=name, **reading))
     for sentence in found.skipped:
         _log.warning(sentence)
-    for sentence in doubt_sentences(found.doubts):
-        warnings.warn(sentence, DoubtfulRunWarning, stacklevel=2)
+    warn_of(found.doubts)
     return Runs(found.runs)
+
+
+def warn_of(doubts: Sequence[Doubt]) -> None:
+    """Warn of doubts about runs, as a function of the package that is called from outside."""
+    for sentence in doubt_sentences(doubts):
+        warnings.warn(sentence, DoubtfulRunWarning, stacklevel=3)
 
 
 class ReadRuns(NamedTuple):

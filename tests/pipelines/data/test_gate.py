@@ -117,3 +117,8 @@ def test_samples_of_a_robot_that_is_served_are_judged_while_it_drives_and_nothin
         sentences += [gate.sentences]
     assert sentences[0] == sentences[-1] == []
     assert next(filter(None, sentences))[0].endswith("9.81 is expected: an accelerometer in g read as m/s^2?")
+
+
+def test_a_run_that_is_made_in_python_is_warned_of_and_not_refused(drive):
+    with pytest.warns(DoubtfulRunWarning, match="r: implausible gravity: .* an accelerometer in g"):
+        face.estimate([with_imu(drive("r", "GRASS", 0, duration_s=8.0), **accel(1 / 9.81))])
