@@ -14,9 +14,8 @@ import numpy as np
 from pipelines.drive.drive import Settings
 from pipelines.drive.run_figures import DriveCurves, drive_curves, run_figures
 from pipelines.learn.parallel import parallel
-from pipelines.live.classifying import Classifier
 from pipelines.live.model import TerrainModel
-from pipelines.live.pilot import LivePilot
+from pipelines.live.pilot import LivePilot, pilot_classifier
 from pipelines.report.figure import Bars, Figure, Panel, Points
 from pipelines.report.numbers import NOT_KNOWN, format_value, plural
 from pipelines.report.results import Progress, Result, described, silent
@@ -100,7 +99,7 @@ def _terrain_source(controller: Controller, model: TerrainModel | None, robot: R
         return KnownTerrain(lambda _: controller.known_terrain)
     if model is None:
         raise ConfigError(f"controller {controller.name!r} needs a classifier: give a model")
-    return Classifier(model, robot)
+    return pilot_classifier(model, robot)
 
 
 def train_classifier(robot: Robot, seed: int, progress: Progress = silent) -> TerrainModel:

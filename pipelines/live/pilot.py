@@ -12,10 +12,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from pipelines.live.chain import Chain, CommandStatus, Step
+from pipelines.live.classifying import Classifier
 from pipelines.live.model import TerrainModel
 from terrain.control.live_state import LiveState
 from terrain.control.robot_control import (
@@ -29,14 +31,32 @@ from terrain.control.robot_control import (
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import SWITCHING, OutputStatus, TerrainSource
 from terrain.control.traction import TractionStatus
-from terrain.estimation.clocks import Clocks, finite_twist
+from terrain.estimation.clocks import Clocks, check_channels, finite_twist
 from terrain.estimation.feed import places_among
 from terrain.estimation.health import SENSORS, Health
 from terrain.estimation.live import CHANNELS, Estimator, LiveEstimate, live_estimator
+from terrain.estimation.models.choice import suitable_filter
 from terrain.extension import correct_live
 from terrain.kinematics.logged_wheels import sensor_channels
 from terrain.records import Command, Sample
 from terrain.robots import Robot
+
+
+def pilot_classifier(
+    model: TerrainModel | None,
+    robot: Robot,
+    thread: ThreadPoolExecutor | None = None,
+    channels: Mapping[str, Sequence[str]] | None = None,
+) -> Classifier:
+    """Return the source of the terrain for a pilot: a model on what is measured and what the pilot's filter estimates.
+
+    ``DataError`` where the model does not suit them; None is a model that comes later.  ``channels`` are as of
+    :class:`LivePilot`.
+    """
+    if robot.drive == "swerve":
+        return Classifier(model, robot, thread)
+    channels = sensor_channels(robot) if channels is None else channels
+    return Classifier(model, robot, thread, channels, suitable_filter(robot, channels))
 
 
 class LivePilot(Chain):
@@ -92,6 +112,7 @@ class LivePilot(Chain):
             taken = {stream: tuple(names) for stream, names in given.items()}
         channels = taken if channels is None else channels
         if settings.controller not in OPEN_LOOP:
+            check_channels("wheels", driven.rate_channels, taken.get("wheels", ()))
             self._filter = live_estimator(driven, taken, correction)
         states = () if self._filter is None else self._filter.states
         self.control = RobotControl(driven, table, settings, states, taken)

@@ -18,11 +18,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationInfo, field_validator
 
 from pipelines.live.chain import COMMAND_VALID_S, Chain, CommandStatus, OnlyWatched, Step
-from pipelines.live.classifying import Classifier
 from pipelines.live.gate import LiveGate
 from pipelines.live.model import TerrainModel
 from pipelines.live.observer import Observer
-from pipelines.live.pilot import LivePilot
+from pipelines.live.pilot import LivePilot, pilot_classifier
 from pipelines.live.recording import RecordingThread, SessionRecorder
 from terrain.control.live_state import LiveState
 from terrain.control.robot_control import PilotSettings
@@ -394,7 +393,8 @@ def chain_of(
     A robot that is watched needs no model.
     """
     if pilot is not None and robot is not None:
-        return LivePilot(robot, table, Classifier(model, robot, thread), pilot, channels=channels)
+        source = pilot_classifier(model, robot, thread, channels)
+        return LivePilot(robot, table, source, pilot, channels=channels)
     if model is None and watched:
         return OnlyWatched("" if robot is None else robot.name, table)
     if model is None:

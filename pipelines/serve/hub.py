@@ -24,10 +24,11 @@ from pipelines.serve.serve import Settings, loaded, required_token
 from pipelines.serve.wire import WireError
 from terrain.control.live_state import LiveState, load_state, to_text
 from terrain.control.slip_table import SlipTable, load_slip_table
+from terrain.control.switching import TerrainSource
 from terrain.discrepancy.watch import read_watched
 from terrain.errors import ConfigError, DataError, LogError, TerrainError
-from terrain.estimation.live import CHANNELS
 from terrain.files.atomic import atomic_write, ensure_writable
+from terrain.kinematics.logged_wheels import sensor_channels
 from terrain.records import Reading, Sample
 from terrain.robots import Robot, load_robot, robot_named
 
@@ -272,17 +273,19 @@ def warm_up(model: TerrainModel, robot: Robot | None) -> None:
         its filter give, or was trained on other robots.
     """
     classify_window(model, drawn_window(model.info))
-    if robot is None or robot.drive != "swerve":
-        if robot is not None and model.info.robots and robot.name not in model.info.robots:
-            trained = ", ".join(model.info.robots)
-            raise DataError(f"the model was trained on runs of {trained}, not of {robot.name}")
+    if robot is None:
         return
-    source, rng = Classifier(model, robot), np.random.default_rng(0)
-    with suppress(ConfigError, DataError):  # it has no pilot
-        pilot = LivePilot(robot, source=source)
+    source, rng, channels = TerrainSource(), np.random.default_rng(0), sensor_channels(robot)
+    if robot.drive == "swerve":
+        source = Classifier(model, robot)
+    elif model.info.robots and robot.name not in model.info.robots:
+        trained = ", ".join(model.info.robots)
+        raise DataError(f"the model was trained on runs of {trained}, not of {robot.name}")
+    with suppress(ConfigError, DataError):  # a section is missing
+        pilot = LivePilot(robot, source=source, channels=channels)
         for time_s in 0.02 * np.arange(WARM_STEPS):
             readings = {
                 stream: Reading(np.array([time_s]), rng.normal(size=(1, len(names))))
-                for stream, names in CHANNELS.items()
+                for stream, names in channels.items()
             }
             pilot.step(Sample(time_s, np.array([0.5, 0.0, 0.0]), readings))

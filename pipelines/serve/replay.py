@@ -232,16 +232,15 @@ def chain_of_run(
     except ConfigError:
         if model is None or needs_filter(model.info, channels):
             raise
-    pilot = None
-    if found is not None and found.drive == "swerve" and (model is not None or not watched):
+    pilot, commands = None, model is None and not watched
+    if found is not None and ((found.drive == "swerve" and model is not None) or commands):
         pilot = PilotSettings(follows=False)  # another controller drove when the log was written
-        for name in channels.keys() & CHANNELS.keys():
-            if lacking := [each for each in CHANNELS[name] if each not in (*channels[name], UNNEEDED)]:
+        required = CHANNELS if found.drive == "swerve" else {"wheels": found.rate_channels}
+        for name in channels.keys() & required.keys():
+            if lacking := [each for each in required[name] if each not in (*channels[name], UNNEEDED)]:
                 raise DataError(
                     f"run {run.run_id}: stream {name} has no channel {lacking[0]!r} for the pilot"
                 )
-    elif model is None and not watched:
-        raise ConfigError(f"run {run.run_id}: robot {run.robot!r} has no pilot: give a model with --model")
     try:
         check_table(table, run.robot)
         return chain_of(found, channels, model, table, pilot, watched=watched)

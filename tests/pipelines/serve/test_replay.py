@@ -59,8 +59,9 @@ def test_a_pilot_gives_what_predict_gives_though_another_controller_drove(grass,
     assert result.windows[-1].target_ratio == pytest.approx(grass_ratio, abs=0.05)
     result, _ = replayed(grass, None)
     assert (result.n_windows, result.accuracy, dict(result.believed)) == (0, None, {"": 1.0})
-    with pytest.raises(ConfigError, match=r"robot 'husky' has no pilot: give a model with --model"):
-        replayed(runs[0], None)
+    assert replayed(runs[0], None)[0].chain == "pilot"
+    with pytest.raises(DataError, match="must be among them"):
+        replayed(RunLog("R", "husky", {"imu": runs[0].streams["imu"]}), None)
 
 
 def test_a_run_that_lacks_what_is_needed_is_refused_in_a_sentence(grass, runs, husky_model, swerve_model):
