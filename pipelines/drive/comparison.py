@@ -60,6 +60,8 @@ from terrain.errors import ConfigError
 from terrain.records import RunLog
 from terrain.robots import Robot, load_robot
 from terrain.simulation.assumed import with_assumed
+from terrain.simulation.run import simulate_run
+from terrain.terramechanics.soil import soil_names
 
 PICTURED = 3  #: Metrics of the first picture
 
@@ -109,9 +111,16 @@ def train_classifier(robot: Robot, seed: int, progress: Progress = silent) -> Te
     """
     from pipelines.learn.settings import RecipeSettings
     from pipelines.learn.training_data import fitted_model
-    from pipelines.slip.labelled import RUNS_A_TERRAIN, labelled_runs
+    from pipelines.slip.labelled import RUNS_A_TERRAIN, SCENARIO, labelled_runs
 
-    runs, _, _ = labelled_runs(seed, RUNS_A_TERRAIN, progress, robot)
+    if robot.drive == "swerve":
+        runs, _, _ = labelled_runs(seed, RUNS_A_TERRAIN, progress, robot)
+    else:  # of what is measured
+        runs, numbers = [], range(1, RUNS_A_TERRAIN + 1)
+        of_runs = [(terrain, number) for terrain in soil_names() for number in numbers]
+        for done, (terrain, number) in enumerate(of_runs, start=1):
+            runs.append(simulate_run(robot, terrain, SCENARIO, seed, number, vary=True))
+            progress("simulate", done, len(of_runs))
     progress("train", 0, 1)
     model = fitted_model(runs, RecipeSettings(seed=seed), "simulated")
     progress("train", 1, 1)
