@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from pipelines.report.results import Progress, Result
 
 EXAMPLE = "terrain drive --scenario starts --terrain grass --table table.yaml --out drives/"
-RESULTS = ("pipelines.drive.comparison", "pipelines.drive.faults", "pipelines.drive.path")
+RESULTS = (
+    *("pipelines.drive.comparison", "pipelines.drive.faults", "pipelines.drive.path"),
+    "pipelines.drive.follow",
+)
 """Modules of the kinds of drive, with their results."""
 
 PAGE_FILE = "report.html"
@@ -35,13 +38,14 @@ Duration = Annotated[float, Field(gt=0.0)]
 class DrivenSettings(JobsSettings):
     """Robot, terrain and seeds."""
 
-    robot: str = setting("agrimaro", "Robot by name, or its YAML file; a car-like one with --path.")
+    robot: str = setting("agrimaro", "Robot by name, or its YAML file.")
     terrain: str = setting("grass")
-    """Name of a soil, its YAML file, or 'course' for all; with --faults some, by commas."""
+    """Name of a soil, its YAML file, or 'course' for all; with --faults some, by commas; not of car-like robots with
+    --path, whose ground has a grip."""
     table: Path | None = setting(None)
     """Table of target slips; by default the packaged one, with --faults one that is learned in simulation."""
     speed_mps: float | None = setting(None, option="--speed", gt=0.0)
-    """Cruising speed in m/s; 1 by default, with --path 3."""
+    """Cruising speed in m/s; 1 by default; with --path 3 of car-like robots, of others at most 0.6 of the motors."""
     seeds: int | None = setting(None, ge=1)
     """Number of seeds: each draws load, soil, tyres and noise; 20 by default, with --faults 1."""
     first_seed: int = setting(0, "First seed.", option="--seed", ge=0)
@@ -102,14 +106,14 @@ class FaultSettings(BaseSettings):
 
 
 class PathSettings(BaseSettings):
-    """A car-like robot along a path (--path)."""
+    """A robot along a path (--path)."""
 
     path: Path | None = setting(None)
     """Follow the path of this CSV file: points in their order, columns x_m and y_m, and roll_rad where it is known."""
-    observer: SlipSourceName = setting("multi", "What gives the sideslip.")
+    observer: SlipSourceName = setting("multi", "What gives the sideslip of a car-like robot.")
     slope_deg: float = setting(0.0, option="--slope", ge=-30.0, le=30.0)
-    """Side slope in degrees, left side up > 0; with roll_rad in the file, that."""
-    grip: float = setting(0.7, "Largest side force over load.", gt=0.0, le=1.5)
+    """Side slope in degrees, left side up > 0; with roll_rad in the file, that; of a car-like robot."""
+    grip: float = setting(0.7, "Largest side force over load, of a car-like robot.", gt=0.0, le=1.5)
     offset: float = setting(0.0, "Desired distance to the left of the path in m.", ge=-100.0, le=100.0)
     stop: Annotated[tuple[float, ...], ByCommas] = setting(())
     """Distances in m at which to stop for 3 s, by commas."""
@@ -143,7 +147,7 @@ class Settings(PathSettings, FaultSettings, ComparisonSettings, DrivenSettings):
         mode = "--path FILE" if self.path is not None else "--faults NAME" if self.faults else ""
         modes: dict[str, type[BaseSettings]] = {"--path FILE": PathSettings, "--faults NAME": FaultSettings}
         if mode:
-            also = ("speed_mps",) if self.faults else ("terrain", "table", "seeds", "n_jobs")
+            also = ("speed_mps",) if self.faults else ("seeds", "n_jobs")
             self.refuse((*ComparisonSettings.model_fields, *also), f"is accepted without {mode.split()[0]}")
         self.refuse_others(mode, modes, "is accepted with {of}")
         return self
@@ -161,7 +165,7 @@ def run(settings: Settings, progress: Progress) -> Result:
 
     if settings.out is not None:
         ensure_writable(settings.out)
-    comparison, faults, path = RESULTS
+    comparison, faults, path, _ = RESULTS
     mode = path if settings.path is not None else faults if settings.faults else comparison
     result: Result = import_module(mode).run(settings, progress)
     if settings.out is not None:

@@ -1,4 +1,4 @@
-"""A car-like robot follows a path of the user in simulation, with an observer of sideslip."""
+"""A robot follows a path of the user in simulation: a car-like one with an observer of sideslip, others by a pilot."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.drive.drive import PAGE_FILE
+from pipelines.drive.follow import FollowResult, follow
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
 from pipelines.report.numbers import format_counts, format_value
 from pipelines.report.results import Progress, Result, described
@@ -28,7 +29,7 @@ from terrain.control.paths import GRID_M, PathStatus, ReferencePath, read_path
 from terrain.errors import ConfigError
 from terrain.estimation.models.observer import ObserverStatus
 from terrain.files.atomic import atomic_write
-from terrain.robots import BicycleRobot, as_drive, load_robot
+from terrain.robots import BicycleRobot, load_robot
 from terrain.simulation.plants.car import CarDrive, Ground
 from terrain.simulation.run import simulate
 from terrain.status import StatusCode
@@ -102,11 +103,13 @@ class PathResult(Result, eq=False):
         return pd.DataFrame(columns)
 
 
-def run(settings: Settings, progress: Progress) -> PathResult:
+def run(settings: Settings, progress: Progress) -> PathResult | FollowResult:
     """Follow the path of the settings in simulation; with ``out`` write the table ``drive.csv`` of the drive."""
     assert settings.path is not None
-    refusal = "robot {name}: drive {drive!r} cannot follow a path, only 'bicycle' can"
-    robot = as_drive(BicycleRobot, load_robot(settings.robot), refusal)
+    robot = load_robot(settings.robot)
+    if not isinstance(robot, BicycleRobot):
+        return follow(settings, robot, progress)
+    settings.refuse(("terrain", "table"), f"is accepted of robots that are not car-like, as {robot.name} is")
     speed_mps = SPEED_MPS if settings.speed_mps is None else settings.speed_mps
     if speed_mps > robot.speed_max_mps:
         raise ConfigError(

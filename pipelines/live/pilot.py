@@ -114,8 +114,7 @@ class LivePilot(Chain):
         if settings.controller not in OPEN_LOOP:
             check_channels("wheels", driven.rate_channels, taken.get("wheels", ()))
             self._filter = live_estimator(driven, taken, correction)
-        states = () if self._filter is None else self._filter.states
-        self.control = RobotControl(driven, table, settings, states, taken)
+        self.control = RobotControl(driven, table, settings, self.filter_states, taken)
         self._steering_zeros_rad = np.array(driven.steering_zeros_rad)
         self._columns = {
             stream: None if tuple(channels[stream]) == names else places_among(names, list(channels[stream]))
@@ -135,6 +134,11 @@ class LivePilot(Chain):
         fresh = super().restore(state, now_s)
         self.control.target_ratio = fresh.target_ratio
         return fresh
+
+    @property
+    def filter_states(self) -> tuple[str, ...]:
+        """Names of the states of its estimates, in the order of their means; none of a controller without."""
+        return () if self._filter is None else self._filter.states
 
     @property
     def target_ratio(self) -> float:

@@ -53,6 +53,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
+from terrain.control.path_following import ACROSS_RAD, LEAST_BESIDE, LOST_STOP_S, curvature_to_path
 from terrain.control.paths import GRID_M, PathStatus, Place, ReferencePath
 from terrain.control.pid import LONGEST_STEP_S, checked
 from terrain.estimation.models.observer import Observer, ObserverOutput, ObserverStatus
@@ -88,9 +89,6 @@ class SteeringSettings(NamedTuple):
     slip_lag_s: float = 0.4
 
 
-_LEAST_BESIDE, _ACROSS_RAD = 0.2, 1.3
-
-
 class SteerState(NamedTuple):
     """The actuator's model m, the last command, and slip angles behind their low-pass."""
 
@@ -124,12 +122,8 @@ def law_17(
     >>> round(law_17(SteeringSettings(), 1.2, 0.0, 0.0, 0.1, 0.0, 0.0), 4)  # atan(L c)
     0.1194
     """
-    gamma = min(max(angle + rear, -_ACROSS_RAD), _ACROSS_RAD)
-    beside = max(1.0 - curvature * lateral, _LEAST_BESIDE)
-    tangent, cos = math.tan(gamma), math.cos(gamma)
-    pull = -settings.position_pm2 * (lateral - settings.offset_m) - settings.angle_pm * beside * tangent
-    pull += curvature * beside * tangent * tangent
-    bend = curvature * cos / beside + pull * (cos * cos * cos) / (beside * beside)
+    gains = settings.position_pm2, settings.angle_pm
+    bend = curvature_to_path(*gains, lateral - settings.offset_m, lateral, angle + rear, curvature)
     return math.atan(math.tan(rear) + base_m / math.cos(rear) * bend) - front
 
 
@@ -158,10 +152,10 @@ def steer(
     curvature = place.curvature_pm if abs(place.curvature_pm) < 1e3 else 0.0
     if not (abs(lateral) < 1e6 and abs(angle) < 1e6):
         status, lateral, angle = SteerStatus.HELD, settings.offset_m, -rear
-    elif 1.0 - curvature * lateral < _LEAST_BESIDE or abs(angle + rear) > _ACROSS_RAD:
+    elif 1.0 - curvature * lateral < LEAST_BESIDE or abs(angle + rear) > ACROSS_RAD:
         status = SteerStatus.SINGULAR
-    gamma = min(max(angle + rear, -_ACROSS_RAD), _ACROSS_RAD)
-    beside = max(1.0 - curvature * lateral, _LEAST_BESIDE)
+    gamma = min(max(angle + rear, -ACROSS_RAD), ACROSS_RAD)
+    beside = max(1.0 - curvature * lateral, LEAST_BESIDE)
     along = robot.wheelbase_m * math.cos(gamma) / beside
     followed = math.atan(along * curvature)
     slower = min(1.0, settings.fastest_ps / max(abs(speed_mps) * math.sqrt(settings.position_pm2), 1e-9))
@@ -192,7 +186,6 @@ def steer(
 
 #: Of the steering, by which the sideslip expected ahead is steered before it comes, beside the dead time.
 REACH_TIME_CONSTANTS = 1.0
-LOST_STOP_S = 3.0  #: Longer without a fix the robot stops.
 
 
 class SlipSource(StrEnum):

@@ -11,10 +11,11 @@ import pytest
 from pipelines.drive.drive import Settings, SlipSourceName, run
 from pipelines.report.results import as_json, silent
 from terrain.control.car_following import SlipSource
+from terrain.errors import ConfigError
 
 
-def follow(**settings):
-    return run(Settings(robot="adap2e", **settings), silent)
+def follow(robot="adap2e", **settings):
+    return run(Settings(robot=robot, **settings), silent)
 
 
 def bend(n=80, radius=12.0):
@@ -66,3 +67,33 @@ def test_a_path_too_tight_is_driven_and_named(tmp_path):
     result = follow(path=file, speed_mps=1.0)
     assert "curvature is 0.6" in result.warnings[0]
     assert any("limit" in warning for warning in result.warnings)
+
+
+def test_a_skid_steer_robot_follows_a_path_with_its_pilot(tmp_path):
+    file, out = tmp_path / "bend.csv", tmp_path / "out"
+    np.savetxt(file, bend(radius=4.0, n=40), delimiter=",", header="x_m,y_m", comments="")
+    result = follow(robot="husky", path=file, terrain="grass", stop=(4.0,), offset=0.5, out=out)
+    assert result.reached_end
+    assert result.lateral_max_m < 0.1
+    assert result.duration_s > result.length_m / result.speed_mps + 3.0
+    assert sum(result.statuses["pilot"].values()) >= sum(result.statuses["path"].values())
+    document = as_json(result)
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+    table = np.genfromtxt(out / "drive.csv", delimiter=",", names=True)
+    assert np.abs(table["lateral_m"] - 0.5).max() == pytest.approx(result.lateral_max_m, rel=1e-3)
+    assert "a tenth of the speed" in result.page.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"robot": "husky", "grip": 0.5}, "--grip is accepted of car-like robots, not of husky"),
+        ({"robot": "husky", "observer": "none"}, "--observer is accepted of car-like robots"),
+        ({"robot": "husky", "speed_mps": 5.0}, "--speed is 5; husky drives at most 1.01 m/s"),
+        ({"robot": "husky", "terrain": "moon"}, "moon"),
+        ({"terrain": "clay"}, "--terrain is accepted of robots that are not car-like, as adap2e is"),
+    ],
+)
+def test_options_of_other_robots_are_refused_in_a_sentence(path_csv, settings, message):
+    with pytest.raises(ConfigError, match=message):
+        follow(path=path_csv, **settings)
