@@ -61,7 +61,7 @@ from terrain.robots import BicycleRobot, Robot
 LEG_S: Mapping[str, float] = {"pose": 1.0, "lidar": 1.0, "gnss": 3.0, "odometry": 1.0}
 #: Legs begin so often within the length of one, so that a fit hardly depends on where the first does.
 STRIDES = 4
-CLOCK_S = 0.02  #: Step of the integrals.
+CLOCK_S = 0.04  #: Step of the integrals; no machine of a metre turns faster than that shows.
 AVERAGED_S = 0.1  #: Places are averaged over that on either side of an end.
 MAX_GAP_S = 0.6  #: Longest time without a sample of wheels, gyro or speeds within a leg.
 #: A leg whose wheels move the sensor by less, and turn it by less, shows nothing.
@@ -80,7 +80,8 @@ FIRST_ERROR = 0.02  #: Size of residuals that a fit begins with, in m and rad, a
 LEAST_ERROR = 1e-4
 TRIED_S = 0.05  #: Steps of delays that are tried before.
 DIFFERENCE = 0.01  #: Step of a derivative, in units of the search.
-SLIP_STEPS = 3  #: Of the slip by traction and the acceleration that it leaves.
+SLIP_STEPS = 2  #: Of the slip by traction and the acceleration that it leaves.
+HEADING_STEPS = 3  #: Of the heading of a receiver and the weights of its fixes.
 PASSES = 3  #: Of a fit that finds the sizes of its residuals.
 STAMP_S = 0.001  #: A delay is trusted to that at best.
 #: Slip of tyres that drive straight on over hard ground: a rolling resistance of 0.02 to 0.04 of the load over a slip
@@ -109,7 +110,7 @@ PARAMETERS: Mapping[str, Parameter] = {
     for p in (
         _known("wheel_radius_ratio"),
         _known("force_slip_ratio", low=0.0),
-        _known("wheel_distance_ratio"),
+        _known("wheel_distance_ratio", low=-0.5, high=1.0),
         _known("wheelbase_ratio"),
         _known("steering_gain_ratio"),
         _known("steering_offset_front_rad"),
@@ -347,7 +348,8 @@ def _laid_out(run: RunLog, robot: Robot, source: str, leg_s: float) -> dict[str,
     if not len(at_s):
         return f"wheels and {WORDS[source]} overlap by less than a leg of {leg_s:g} s"
     nearest = np.clip(np.round((seen.time_s - at_s[0]) / (leg_s / STRIDES)).astype(int), 0, len(at_s) - 1)
-    near = np.abs(seen.time_s - at_s[nearest]) <= AVERAGED_S
+    apart_s = np.abs(seen.time_s - at_s[nearest])  # of a slow reference the nearest sample is an end
+    near = apart_s <= max(AVERAGED_S, min(leg_s / STRIDES, float(np.median(np.diff(seen.time_s)))) / 2)
     end_of, n = nearest[near], len(at_s)
     count = np.bincount(end_of, minlength=n)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -398,7 +400,10 @@ def lay_out(runs: Sequence[RunLog], robot: Robot, source: str, leg_s: float | No
     DataError
         if none of the runs has wheels, steering and the reference.
     """
-    chosen_s = LEG_S[source] if leg_s is None else leg_s
+    period_s = [
+        np.median(np.diff(run.streams[source].time_s)) for run in runs if len(run.streams.get(source, ())) > 1
+    ]
+    chosen_s = max(LEG_S[source] if leg_s is None else leg_s, 2.0 * float(max(period_s, default=0.0)))
     parts, used, why, from_s = list[dict[str, Array]](), list[RunLog](), "", 0.0
     n_ends, n_blocks = 0, 0
     for run in runs:
@@ -550,16 +555,20 @@ def errors_of(log: Log, robot: Robot, p: Mapping[str, float]) -> tuple[Array, Ar
     turned_by = np.zeros(len(log.moved))
     for last in (False, True):
         headed = legs.moved * np.exp(1j * legs.yaw_rad)
-        seen = log.weight**2 * log.moved * np.conj(headed)
-        heading = np.angle(_sums(log.block, seen.real) + 1j * _sums(log.block, seen.imag))
-        turned_by = heading[log.block]
+        weight = log.weight**2
+        for _ in range(HEADING_STEPS):
+            seen = weight * log.moved * np.conj(headed)
+            heading = np.angle(_sums(log.block, seen.real) + 1j * _sums(log.block, seen.imag))
+            turned_by = heading[log.block]
+            apart_m = log.weight * np.abs(
+                log.moved * np.exp(-1j * turned_by) - headed
+            )  # fixes that jump count less
+            weight = log.weight**2 / (1.0 + (apart_m / (3.0 * np.median(apart_m) + 1e-9)) ** 2)
         if last or not has_gyro:
             break
         # what is left of directions along time, weighted by the paths behind them, beside what rest shows of the bias
         left = np.angle(seen * np.exp(-1j * turned_by))
-        weight = (
-            np.where(np.abs(left) < 0.5, (log.weight * np.abs(headed)) ** 2, 0.0) / max(log.std_m, 1e-3) ** 2
-        )
+        weight = np.where(np.abs(left) < 0.5, weight * np.abs(headed) ** 2, 0.0) / max(log.std_m, 1e-3) ** 2
         total = np.maximum(_sums(log.block, weight), 1e-12)
         time_s = log.middle_s - (_sums(log.block, weight * log.middle_s) / total)[log.block]
         slope = np.bincount(log.run, weight * time_s * left, minlength=n)

@@ -172,7 +172,7 @@ RTK_TRUTH = {
 
 def rtk_run(
     seed,
-    n_turns=18,
+    n_turns=12,
     terrain="asphalt",
     slip=0.01,
     turning=0.8,
