@@ -877,6 +877,7 @@ IDENTIFIED: Mapping[str, float | None] = {
     "pose_yaw_rad": -math.inf,
     "pose_delay_s": -math.inf,
     "gnss_delay_s": -math.inf,
+    "steering_delay_s": -math.inf,
     "odometry_delay_s": -math.inf,
     "gyro_scale_ratio": None,
     "imu_roll_rad": -math.inf,

@@ -56,8 +56,8 @@ from terrain.logs.schema import POSE_CHANNELS, TWIST
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import BicycleRobot, Robot
 
-#: What measures motion, and the length of a leg: a robot of 0.1 m/s moves by a hundred times the noise of motion
-#: capture in a second, and one of 0.5 m/s by as much of a receiver's in three.
+#: What measures motion, what shows most first, and the length of a leg: a robot of 0.1 m/s moves by a hundred times the
+#: noise of motion capture in a second, and one of 0.5 m/s by as much of a receiver's in three.
 LEG_S: Mapping[str, float] = {"pose": 1.0, "lidar": 1.0, "gnss": 3.0, "odometry": 1.0}
 #: Legs begin so often within the length of one, so that a fit hardly depends on where the first does.
 STRIDES = 4
@@ -121,6 +121,7 @@ PARAMETERS: Mapping[str, Parameter] = {
         Parameter("lever_y_m", 0.0, prior_std=1.0, step=0.1),
         Parameter("camera_latency_s", 0.0, -0.5, 1.0, step=0.02),
         Parameter("wheels_delay_s", 0.0, -0.5, 0.5, step=0.02),
+        Parameter("steering_delay_s", 0.0, -0.5, 0.5, 0.1, step=0.02),
         Parameter("gyro_scale_ratio", 0.0, -0.2, 0.2, prior_std=0.02),
         Parameter("effective_track_ratio", 0.0, -0.5, 5.0, step=0.05),
         Parameter(
@@ -169,6 +170,7 @@ KINEMATIC = (
         "identified.understeer_s2pm", "understeer_s2pm", lambda robot, e: e + robot.understeer_s2pm, 0.035
     ),
     Number("identified.wheels_delay_s", "wheels_delay_s", _plain, 0.25),
+    Number("identified.steering_delay_s", "steering_delay_s", _plain, 0.1),
     Number("identified.gyro_scale_ratio", "gyro_scale_ratio", lambda robot, e: 1.0 / (1.0 + e), 0.02),
 )
 #: Of the sensor that is the reference: its place, its yaw in the body, its delay.
@@ -215,6 +217,7 @@ def parameters_of(robot: Robot, source: str, has_gyro: bool) -> tuple[str, ...]:
         names += [GAIN, "steering_offset_front_rad"]
         own = ["wheelbase_ratio"], ["understeer_s2pm", "cornering_stiffness_ratio"]
         names += own[0] if robot.front_driven else own[1]
+    names += ["steering_delay_s"] * robot.steered
     names += ["camera_yaw_rad"] * (source != "gnss") + ["lever_x_m", "lever_y_m", "camera_latency_s"]
     return (*names, *["wheels_delay_s", "gyro_scale_ratio"] * has_gyro)
 
@@ -489,6 +492,7 @@ def computed(log: Log, robot: Robot, p: Mapping[str, float], bias_radps: Array) 
     speeds = np.column_stack([np.interp(at_s, log.wheels_s, each) for each in log.speed_mps.T])
     steer = np.zeros((1, len(robot.wheels)))
     if robot.steered:
+        at_s = at_s + e["steering_delay_s"]
         steer = np.column_stack([np.interp(at_s, log.steer_s, each) for each in log.steer_rad.T])
         steer = (1.0 + e[GAIN]) * steer + e["steering_offset_front_rad"]
     twist = rolled_twist(robot, speeds, steer)
@@ -746,7 +750,8 @@ def findings_by(
         value, std = float(fit.value[k]), float(fit.std[k])
         at, low, high = (number.value(robot, value + by * std) for by in (0.0, -1.0, 1.0))
         bounded = STAMP_S if name.endswith("delay_s") else 0.0
-        notes = [NOTE.get(name, ""), BEHIND[not len(log.gyro_s)] if name.endswith("delay_s") else ""]
+        behind = BEHIND[not len(log.gyro_s)] if name != "steering_delay_s" else "behind the wheel speeds"
+        notes = [NOTE.get(name, ""), behind if name.endswith("delay_s") else ""]
         notes += [TURNING] * (robot.skids and number.place == "antenna.lever_x_m")
         if robot.skids and name == "rolling_radius_m" and stated:
             least, most = SLIP_RATIO if hard else SOFT_SLIP_RATIO
@@ -785,8 +790,8 @@ def _by_turning(fitted: MotionFit, robot: Robot, where: str) -> list[Finding]:
 def motion_findings(runs: Sequence[RunLog], robot: Robot, hard: Sequence[str] = ()) -> list[Finding]:
     """Return what references show of a robot of any drive, or why they do not.
 
-    Each reference gives the place and delay of its own sensor; of kinematic numbers that several show, the one with the
-    narrowest interval counts.  A robot that skids is calibrated on its hard ground where runs are labelled so, on all
+    Each reference gives the place and delay of its own sensor; of kinematic numbers that several show, the first of
+    :data:`LEG_S` counts.  A robot that skids is calibrated on its hard ground where runs are labelled so, on all
     else, and its effective track on each ground beside it.
     """
     any_gyro = any("gyro_z_radps" in run.streams["imu"].channels for run in runs if "imu" in run.streams)
@@ -827,10 +832,8 @@ def motion_findings(runs: Sequence[RunLog], robot: Robot, hard: Sequence[str] = 
         if source == "gnss" and len(fitted.log.gyro_s) and not fitted.log.bias_radps.any():
             rows += _bias_in_motion(fitted)
         for row in rows:
-            before = found.get(row.parameter)
-            width = row.high - row.low
-            if before is None or not before.determined or width < before.high - before.low:
-                found[row.parameter] = row if row.determined or before is None else before
+            if row.parameter not in found or not found[row.parameter].determined:
+                found[row.parameter] = row
     shown = parameters_of(robot, sources[0] if sources else "pose", True)
     for number in KINEMATIC:
         name = number.place.partition(".")[2]

@@ -3,10 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from studies.intervals import HIDDEN, NOMINAL, drive_hidden
+from studies.intervals import HIDDEN, NOMINAL, RTK_TRUTH, drive_hidden, rtk_run
 
 from pipelines.report.results import silent
 from pipelines.slip.calibrate import Settings, run
+from terrain.errors import DataError
 from terrain.estimation.feed import measurement_table
 from terrain.logs.run_folders import write_run
 from terrain.robots import description_file, load_robot
@@ -116,3 +117,72 @@ def test_runs_tell_what_they_can_and_why_not_the_rest(tmp_path, kept):
     why = "never move" if kept == "stand alone" else "no run has a camera (stream 'odometry')"
     for parameter in ("steering.zero_2_rad", "motors.reduction_ratio", "camera.time_constant_s"):
         assert why in found[parameter].note
+
+
+FOUR_NUMBERS = """name: husky
+drive: skid_steer
+wheel_radius_m: {value: 0.165, unit: m, source: maker}
+track_m: {value: 0.5708, unit: m, source: maker}
+wheelbase_m: {value: 0.512, unit: m, source: maker}
+mass_kg: {value: 50.0, unit: kg, source: maker}
+"""
+
+
+@pytest.fixture
+def four_numbers(tmp_path):
+    file = tmp_path / "husky.yaml"
+    file.write_text(FOUR_NUMBERS, encoding="utf-8")
+    return file
+
+
+def write_rtk(folder, n=5, missing=(), **options):
+    for k in range(n):
+        each, _ = rtk_run(k, **options)
+        write_run(replace(each, streams={s: v for s, v in each.streams.items() if s not in missing}), folder)
+    return folder
+
+
+def test_a_robot_of_four_numbers_with_rtk_gets_a_whole_description(four_numbers, tmp_path):
+    out = tmp_path / "calibrated.yaml"
+    result = calibrate(write_rtk(tmp_path / "runs"), str(four_numbers), out)
+    robot = load_robot(out)
+    for name in ("rolling_radius_m", "effective_track_m", "wheels_delay_s", "gnss_delay_s"):
+        assert robot.identified[name] == pytest.approx(RTK_TRUTH[name], rel=0.1), name
+    assert robot.antenna.lever_x_m == pytest.approx(RTK_TRUTH["lever_x_m"], abs=0.02)
+    assert robot.sensors.gyro_std_radps == pytest.approx(0.004, rel=0.1)
+    assert robot.sensors.accel_std_mps2 == pytest.approx(0.05, rel=0.1)
+    assert abs(robot.sensors.gyro_bias_z_radps) < 0.01
+    assert "sensors.imu_rate_hz" in robot.assumed
+    assert "sensors.gyro_std_radps" not in robot.assumed
+    assert "numbers of husky are determined by 5 runs" in result.report.answer
+    again = calibrate(tmp_path / "runs", str(out))
+    assert len(again.findings) >= len(result.findings)
+
+
+@pytest.mark.parametrize(
+    ("missing", "number", "why"),
+    [
+        ("gnss", "identified.rolling_radius_m", "stream 'pose', 'lidar', 'gnss' or 'odometry'"),
+        ("imu", "identified.wheels_delay_s", "no run has a gyro"),
+        ("imu", "sensors.gyro_bias_z_radps", "no run has an IMU (stream 'imu')"),
+        ("none", "identified.torque_per_current_nmpa", "no run has currents"),
+    ],
+)
+def test_a_stream_that_is_missing_is_named_with_what_it_would_show(
+    four_numbers, tmp_path, missing, number, why
+):
+    result = calibrate(write_rtk(tmp_path / "runs", missing=(missing,)), str(four_numbers))
+    found = {finding.parameter: finding for finding in result.findings}
+    assert not found[number].determined
+    assert why in found[number].note
+    assert any(finding.determined for finding in result.findings)
+
+
+def test_runs_that_show_nothing_or_are_of_another_robot_are_one_sentence(four_numbers, tmp_path):
+    silent_runs = write_rtk(tmp_path / "silent", n=1, missing=("gnss", "imu"), n_turns=2)
+    with pytest.raises(DataError, match="nothing of robot husky can be calibrated from this: no run has"):
+        calibrate(silent_runs, str(four_numbers))
+    other = tmp_path / "other.yaml"
+    other.write_text(FOUR_NUMBERS.replace("name: husky", "name: mine"), encoding="utf-8")
+    with pytest.raises(DataError, match="is one of robot 'husky', and 'mine' is calibrated"):
+        calibrate(write_rtk(tmp_path / "runs", n=1), str(other))
