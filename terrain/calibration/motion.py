@@ -78,6 +78,7 @@ MIN_LEGS = 48
 APART_S = 10.0  #: Runs are laid out on one axis of time, so far apart.
 FIRST_ERROR = 0.02  #: Size of residuals that a fit begins with, in m and rad, and the least.
 LEAST_ERROR = 1e-4
+NEAR_BOUND = 0.02  #: Part of the range of a parameter within which it stands at its end.
 TRIED_S = 0.05  #: Steps of delays that are tried before.
 DIFFERENCE = 0.01  #: Step of a derivative, in units of the search.
 SLIP_STEPS = 2  #: Of the slip by traction and the acceleration that it leaves.
@@ -740,8 +741,7 @@ def findings_by(
     """
     log, fit, found = fitted.log, fitted.fit, list[Finding]()
     ids, dof = [run.run_id for run in log.runs], len(fit.influence) - 1
-    place = fitted.names.index("wheel_radius_ratio") if "wheel_radius_ratio" in fitted.names else -1
-    contradicted = place >= 0 and bool(fit.at_bound[place])
+    contradicted = contradicts(fitted)
     for number in (*KINEMATIC, *SENSOR[log.source]):
         name = number.place.partition(".")[2]
         if number.of not in fitted.names or NOT_OF.get(name) == robot.drive:
@@ -770,6 +770,15 @@ def findings_by(
     if "narrowing_ratio" in fitted.names and not contradicted:
         found += _by_turning(fitted, robot, where)
     return found
+
+
+def contradicts(fitted: MotionFit) -> bool:
+    """Return whether radius or track are as far off as a fit may go: then no number of it is one of the robot."""
+    for name in {"wheel_radius_ratio", "effective_track_ratio"} & set(fitted.names):
+        p, value = PARAMETERS[name], fitted.values[name]
+        if min(value - p.low, p.high - value) < NEAR_BOUND * (p.high - p.low):
+            return True
+    return False
 
 
 def _by_turning(fitted: MotionFit, robot: Robot, where: str) -> list[Finding]:
