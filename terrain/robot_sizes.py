@@ -206,8 +206,9 @@ def _sizes(robot: Robot) -> Iterator[Size]:
     if robot.describes("motors"):
         yield from _motor_sizes(robot)
     for key, value in robot.identified.items():
-        if key in IDENTIFIED_OVER_NOMINAL:
-            of, low, high = IDENTIFIED_OVER_NOMINAL[key]
+        of_all = "effective_track_m" if key.startswith("effective_track_") else key  # or of one ground
+        if of_all in IDENTIFIED_OVER_NOMINAL:
+            of, low, high = IDENTIFIED_OVER_NOMINAL[of_all]
             nominal = getattr(robot, of)
             yield Size(f"identified.{key}", value, low * nominal, high * nominal, f"{of} is {nominal:.3g} m")
     yield from _alone("identified.", robot.identified, size_m)
@@ -249,7 +250,9 @@ def _body_sizes(robot: Robot, size_m: float) -> Iterator[Size]:
     yield Size("body.com_y_m", body.com_y_m, -size_m, size_m, f"a robot of {size_m:.3g} m")
     yield Size("body.com_height_m", body.com_height_m, 0.0, 2.0 * size_m, f"a robot of {size_m:.3g} m")
     yield Size("body.tyre_width_m", body.tyre_width_m, 0.02 * radius_m, 5.0 * radius_m, of_wheel)
-    yield Size("body.contact_length_m", body.contact_length_m, 0.01 * radius_m, 2.0 * radius_m, of_wheel)
+    # of a tyre a chord, of a track a part of its length
+    longest_m = max(2.0 * radius_m, robot.wheelbase_m if robot.drive == "tracked" else 0.0)
+    yield Size("body.contact_length_m", body.contact_length_m, 0.01 * radius_m, longest_m, of_wheel)
     yield Size(
         "body.relaxation_length_m", body.relaxation_length_m, 0.005 * radius_m, 20 * radius_m, of_wheel
     )

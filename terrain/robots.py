@@ -526,11 +526,11 @@ class Robot(ABC):
         if body.footprint_min_m > body.footprint_max_m:
             raise ConfigError(f"{place}: footprint_min_m {body.footprint_min_m} is over footprint_max_m")
         low_m, high_m = body.footprint_min_m - body.tyre_width_m, body.footprint_max_m - body.tyre_width_m
-        if not low_m <= self.track_m <= high_m:
+        if not low_m - 1e-9 <= self.track_m <= high_m + 1e-9:  # sums of what is written with few digits
             raise ConfigError(
                 f"{place}: track_m is {self.track_m:g}; the footprint allows {low_m:g} to {high_m:g} m"
             )
-        if self.n_tyres == 3:
+        if len(self.wheels) == 3:
             self.check_load(place)
 
     def check_load(self, place: str) -> None:

@@ -10,7 +10,18 @@ import yaml
 
 from terrain.errors import ConfigError
 from terrain.files.names import data_folder
-from terrain.robots import Robot, SkidSteerRobot, SwerveRobot, as_drive, load_robot
+from terrain.robots import (
+    BicycleRobot,
+    MecanumRobot,
+    Robot,
+    SkidSteerRobot,
+    SwerveRobot,
+    TrackedRobot,
+    TricycleRobot,
+    as_drive,
+    load_robot,
+)
+from terrain.simulation.assumed import with_assumed
 
 NAMES = ("agrimaro", "husky", "robotino", "adap2e", "orchard_ugv")
 AGRIMARO, HUSKY, ROBOTINO, CAR, UGV = ROBOTS = [load_robot(name) for name in NAMES]
@@ -113,6 +124,7 @@ BAD_SIZES = [
     (HUSKY, "camera.latency_s", 20.0, "in ms?"),
     (HUSKY, "sensors.gyro_bias_z_radps", 3.0, "in deg/s?"),
     (HUSKY, "identified.effective_track_m", 5.0, "track_m is 0.571 m"),
+    (HUSKY, "identified.effective_track_grass_m", 5.0, "track_m is 0.571 m"),
     (HUSKY, "identified.rolling_radius_m", 0.33, "wheel_radius_m is 0.165 m"),
     (AGRIMARO, "steering.rate_max_radps", 120.0, "in deg/s?"),
     (AGRIMARO, "steering.zero_1_rad", 90.0, "in deg?"),
@@ -158,6 +170,30 @@ def test_sizes_belong_together_at_any_scale(robot, factor):
     if robot is UGV:
         scaled |= {"com_height_m": robot.com_height_m * factor, "track_width_m": robot.track_width_m * factor}
     replace(robot, **scaled).check_geometry("robot")
+
+
+#: Robots of four numbers, and of what their drive needs beside.
+BUILT = [
+    SkidSteerRobot("quad", 0.3, 1.6, 2.2, 1200.0),
+    SkidSteerRobot("mini", 0.05, 0.25, 0.2, 3.0),
+    SkidSteerRobot("gantry", 0.2, 3.0, 1.5, 150.0),
+    SkidSteerRobot("narrow", 0.1, 0.3, 1.2, 60.0),
+    TrackedRobot("harvester", 0.4, 3.0, 4.5, 25_000.0, track_width_m=0.6, com_height_m=1.5),
+    MecanumRobot("cart", 0.05, 0.3, 0.4, 20.0),
+    BicycleRobot("tractor", 0.8, 1.8, 2.6, 5000.0, com_ahead_m=1.0, com_height_m=1.0, yaw_inertia_kgm2=6000.0,
+                 front_cornering_npr=2e5, rear_cornering_npr=3e5),
+    BicycleRobot("model car", 0.05, 0.25, 0.32, 3.5, com_ahead_m=0.16, com_height_m=0.05, yaw_inertia_kgm2=0.05,
+                 front_cornering_npr=60.0, rear_cornering_npr=60.0),
+    BicycleRobot("dump truck", 1.9, 7.0, 7.2, 300_000.0, com_ahead_m=3.0, com_height_m=3.0, yaw_inertia_kgm2=3e6,
+                 front_cornering_npr=4e6, rear_cornering_npr=6e6),
+    TricycleRobot("pallet jack", 0.04, 0.5, 1.2, 80.0, com_ahead_m=0.6, yaw_inertia_kgm2=10.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("robot", BUILT)
+def test_sizes_of_vehicles_that_are_built_and_what_is_assumed_of_them_belong_together(robot):
+    robot.check_geometry("robot")
+    with_assumed(robot).check_geometry("robot")
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pytest
 import terrain as face
 from pipelines.live.gate import LiveGate
 from terrain.errors import DoubtfulRunWarning, LogError
+from terrain.files.names import data_folder
 from terrain.logs.replay import replay
 from terrain.logs.run_folders import write_run
 from terrain.records import Stream
@@ -122,3 +123,27 @@ def test_samples_of_a_robot_that_is_served_are_judged_while_it_drives_and_nothin
 def test_a_run_that_is_made_in_python_is_warned_of_and_not_refused(drive):
     with pytest.warns(DoubtfulRunWarning, match="r: implausible gravity: .* an accelerometer in g"):
         face.estimate([with_imu(drive("r", "GRASS", 0, duration_s=8.0), **accel(1 / 9.81))])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(("simulate", "--terrain", "grass", "--scenario", "straight", "--out", "out"),),
+        *(
+            ("drive", "--terrain", "grass", "--scenario", "starts"),
+            ("inspect", "data"),
+        ),
+        *(("convert", "data", "--out", "out"), ("estimate", "--data", "data", "--filter", "skid")),
+        *(("calibrate", "--data", "data"), ("explain", "--data", "data", "--out", "out")),
+        *(("crossval", "--data", "data"), ("learn-slip", "--data", "data", "--out", "table.yaml")),
+    ],
+)
+def test_a_robot_whose_sizes_do_not_belong_together_is_refused_by_every_command(refused, place, drive, words):
+    text = (data_folder("robots") / "husky.yaml").read_text()
+    (place / "mine.yaml").write_text(
+        text.replace("wheel_radius_m: {value: 0.165", "wheel_radius_m: {value: 22")
+    )
+    write_run(drive("r", "GRASS", 0, duration_s=4.0), place / "data")
+    refused(
+        "mine.yaml: wheel_radius_m is 22, 0.004 to 2.5 m is expected: in cm?", *words, "--robot", "mine.yaml"
+    )
