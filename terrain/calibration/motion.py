@@ -773,12 +773,11 @@ def findings_by(
 
 
 def contradicts(fitted: MotionFit) -> bool:
-    """Return whether radius or track are as far off as a fit may go: then no number of it is one of the robot."""
-    for name in {"wheel_radius_ratio", "effective_track_ratio"} & set(fitted.names):
-        p, value = PARAMETERS[name], fitted.values[name]
-        if min(value - p.low, p.high - value) < NEAR_BOUND * (p.high - p.low):
-            return True
-    return False
+    """Return whether the radius is as far off as a fit may go: then no number of it is one of the robot."""
+    if "wheel_radius_ratio" not in fitted.names:
+        return False
+    p, value = PARAMETERS["wheel_radius_ratio"], fitted.values["wheel_radius_ratio"]
+    return min(value - p.low, p.high - value) < NEAR_BOUND * (p.high - p.low)
 
 
 def _by_turning(fitted: MotionFit, robot: Robot, where: str) -> list[Finding]:
