@@ -61,7 +61,7 @@ States are integrated with semi-implicit steps of :data:`STEP_S`.  What acts, in
 - **rollers** of omni and mecanum wheels hold the ground along their axis alone, at the angle g to the direction d that
   the wheel drives along: ``du/dt = w r cos g - v_axis - max(|w r|, |v|) u / sigma``.  Across it they turn with
   ``v_across + w r sin g``, against a friction of ``roller_friction_ratio`` of the load times that speed over the
-  larger of wheel speed and speed over ground.
+  larger of wheel speed and speed over ground; what resists rolling opposes the motion of the wheel in any direction.
 - **differential**: with the inertia I of an axle, ``I dw/dt = T - r (F_l + F_r)`` for the mean rate w, and
   ``I dq/dt = r (F_l - F_r)`` for half the difference q of the rates of its tyres; T is 0 without a motor.
 - **leg**: the third wheel's leg swings about a hinge on the line of the other two, within
@@ -133,7 +133,7 @@ LOAD_MARGIN_RATIO = 2.0
 
 # A contact that is stiffer than the steps allow, by so much at most, as those of small wheels are, relaxes over a
 # longer distance: slip in steady motion is the same.
-MAX_RELAXED = 4.0
+MAX_RELAXED = 8.0
 
 _SMALL_SLIP = 1e-4
 
@@ -571,10 +571,12 @@ def step(
             more = plant.effects.rolling_resistance_ratio + plant.effects.slip_resistance_ratio * slip
             resistance += more * normal_n
             resistance = max(resistance + plant.effects.viscous_drag_nspm * abs(along) / 3.0, 0.0)
-        # what resists acts at the axle, against the rolling of the wheel
-        against = resistance * math.tanh((cos_roller * along - sin_roller * across) / ROLLING_SPEED_MPS)
+        # what resists acts at the axle, against the rolling of the wheel, or of the wheel and its rollers
         traction, aside = thrust * cos_roller - side * sin_roller, thrust * sin_roller + side * cos_roller
-        pull, side_n = thrust - against * cos_roller, side + against * sin_roller
+        pull, side_n = thrust - resistance * math.tanh(along / ROLLING_SPEED_MPS), side
+        if plant.rollers and rolled > 0.0:
+            against = resistance * math.tanh(rolled / ROLLING_SPEED_MPS) / rolled
+            pull, side_n = thrust - against * along, side - against * across
         w.load_nm += traction * radius_m
         w.spread_nm += at.side_ratio * traction * radius_m
         t.along_mps, t.drift_mps, t.fastest_mps = along, drift_along, fastest
@@ -823,7 +825,7 @@ def run_dynamic(
     plant = make_plant(built, conditions)
     stiff = contact_stiffness(plant, profile)
     if 1.0 < stiff <= MAX_RELAXED:
-        plant["relaxation_length_m"] *= stiff
+        plant["relaxation_length_m"] *= 1.001 * stiff  # beyond rounding
     check_step(plant, profile, built.name)
     n_steps = len(scenario.time_s) * substeps
     n_wheels, n_contacts = len(robot.wheels), int(plant["n_contacts"][0])
