@@ -133,7 +133,7 @@ LOAD_MARGIN_RATIO = 2.0
 
 # A contact that is stiffer than the steps allow, by so much at most, as those of small wheels are, relaxes over a
 # longer distance: slip in steady motion is the same.
-MAX_RELAXED = 8.0
+MAX_RELAXED = 5.0
 
 _SMALL_SLIP = 1e-4
 
