@@ -65,17 +65,20 @@ from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot
 from terrain.slip import MIN_SPEED_MPS, slip_ratio
 
-FAST_S, ACROSS_S = 0.5, 1.0
+FAST_S, ACROSS_S = 0.5, 5.0
 """Over which d, and sideways speed of a robot that cannot drive sideways, are forgotten."""
 FAST_RATIO, FAST_PER_MPS2, FAST_TURNING = 0.01, 0.12, 0.06
 """Standard deviation of d in steady straight motion; what an acceleration of the wheels of 1 m/s^2, a tenth of the
 weight in traction, adds; and what turning on the spot does."""
+YIELDING_RATIO = 0.3
+"""Length over the radius of a wheel that it rolls from rest until the contact pulls: tyre and soil yield first, a track
+and a gear have slack; d is then of the order of 1."""
 SLOW_RATIO, SLOW_WALK = 0.2, 0.012
 """Of m at first, about 0, and its walk within a second of driving."""
 TURN_WALK, DIRECTION_RATIO = 0.02, 0.15
 """Walk of chi within a second of turning, and of m of a robot that drives in any direction where that changes by a
 radian: its wheels pull in another one."""
-ACROSS_RATIO, ACROSS_M = 0.01, 0.05
+ACROSS_RATIO, ACROSS_M = 0.03, 0.05
 """Sideways speed over the speed of the wheels, and over the yaw rate: of a robot that skids, and in turns."""
 WHEEL_STD_MPS, GYRO_STD_RADPS, YAW_ACCEL = 0.01, 0.005, 1.0
 """Of a wheel's speed and a gyro's rate; walk of the yaw rate within a second."""
@@ -122,12 +125,12 @@ MOST_ROWS = 6  # of a swerve robot: along and across each wheel
 _N_ROWS, _N_SLOW, _TURNS, _FREE_ACROSS, _ANTENNA, _POSED, _SEEN, _GROUP = 0, 1, 2, 3, 4, 6, 8, 10
 _D = _GROUP + MOST_ROWS
 _U, _T, _SIZE = _D + 3 * MOST_ROWS, _D + 4 * MOST_ROWS, _D + 5 * MOST_ROWS
-_ACCEL, _AGES = _SIZE + 1, _SIZE + 2
+_ACCEL, _MEAN_ACCEL, _AGES = _SIZE + 1, _SIZE + 2, _SIZE + 3
 _SPEEDS, _TURNING = slice(_U - _D, _T - _D), slice(_T - _D, _SIZE - _D)  # among the inputs
 _INPUTS = (
     *(f"d_{i}" for i in range(3 * MOST_ROWS)),
     *(f"{name}_{i}" for name in "ut" for i in range(MOST_ROWS)),
-    *("size", "accel", "gnss_age", "pose_age", "camera_age"),
+    *("size", "accel", "mean_accel", "gnss_age", "pose_age", "camera_age"),
 )
 
 _REFERENCES = (
@@ -177,9 +180,10 @@ def _wheels(x: Array, params: Array, z: Array) -> None:
 
 
 @njit
-def _placed(x: Array, age: float, lever_x: float, lever_y: float, params: Array, z: Array) -> None:
+def _placed(x: Array, sensor: int, lever_x: float, lever_y: float, params: Array, z: Array) -> None:
     """Write position and velocity in the world of a point of the body, an age ago."""
-    accel = params[_ACCEL] - x[_ACCEL_BIAS] if math.isfinite(params[_ACCEL]) else 0.0
+    age, accel = params[_AGES + sensor] + x[_DELAY], params[_MEAN_ACCEL]
+    accel = accel - x[_ACCEL_BIAS] if math.isfinite(accel) else 0.0
     along, across = x[_VX] - age * (accel + x[_W] * x[_VY]), x[_VY]
     middle, then = x[_YAW] - 0.5 * age * x[_W], x[_YAW] - age * x[_W]
     mean = 0.5 * (along + x[_VX])
@@ -197,24 +201,16 @@ def _measure(x: Array, _dt: float, params: Array, z: Array) -> None:
     z[:] = 0.0
     _wheels(x, params, z)
     z[MOST_ROWS] = x[_W] + x[_GYRO_BIAS]
-    _placed(
-        x,
-        params[_AGES] + x[_DELAY],
-        params[_ANTENNA],
-        params[_ANTENNA + 1],
-        params,
-        z[MOST_ROWS + 1 : MOST_ROWS + 5],
-    )
+    _placed(x, 0, params[_ANTENNA], params[_ANTENNA + 1], params, z[MOST_ROWS + 1 : MOST_ROWS + 5])
     pose = np.zeros(4)
-    age = params[_AGES + 1] + x[_DELAY]
-    _placed(x, age, params[_POSED], params[_POSED + 1], params, pose)
+    _placed(x, 1, params[_POSED], params[_POSED + 1], params, pose)
     fix = z[MOST_ROWS + 5 :]
-    fix[0], fix[1], fix[2] = pose[0], pose[1], x[_YAW] - age * x[_W]
+    fix[0], fix[1], fix[2] = pose[0], pose[1], x[_YAW] - (params[_AGES + 1] + x[_DELAY]) * x[_W]
     fix[3] = x[_YAW]
     fix[4] = x[_VX] - x[_W] * params[_SEEN + 1]
     fix[5] = x[_VY] + x[_W] * params[_SEEN]
-    if math.isfinite(params[_ACCEL]):
-        fix[4] -= (params[_AGES + 2] + x[_DELAY]) * (params[_ACCEL] - x[_ACCEL_BIAS])
+    if math.isfinite(params[_MEAN_ACCEL]):
+        fix[4] -= (params[_AGES + 2] + x[_DELAY]) * (params[_MEAN_ACCEL] - x[_ACCEL_BIAS])
 
 
 @njit
@@ -346,7 +342,7 @@ class SlipFilter(FilterObserver):
         place = robot.wheel_positions_m, robot.wheel_directions_rad, robot.roller_angles_rad
         self._rolling, self._steer = rolling_matrix(*place)[logged], steer
         self._smooth_mps, self._accel_mps2, self._shaken_square = np.full(len(logged), np.nan), math.nan, 0.0
-        self._pulls, self._accel_is_wrong = np.zeros(MOST_ROWS), False
+        self._pulls, self._accel_is_wrong, self._rolled_m = np.zeros(MOST_ROWS), False, 0.0
         bounds = [DELAY_BOUNDS_S, *[SLIP_BOUNDS] * n_slow, *[LOSS_BOUNDS] * turns, *[SLIP_BOUNDS] * n_rows]
         self._bounds = np.array(bounds)
         self._poses = np.zeros((0, 4))  # age in ticks' time, position and heading
@@ -428,19 +424,22 @@ class SlipFilter(FilterObserver):
         size = math.sqrt(float(np.mean(known**2)))
         ages = [given[name] if 0.0 <= given[name] <= OLDEST_S else 0.0 for name in _AGE_ROWS]
         inputs[: 3 * MOST_ROWS], inputs[_SPEEDS][:n], inputs[_TURNING] = rolling.ravel(), known, turning
-        inputs[_SIZE - _D :] = size, accel, *ages
+        inputs[_SIZE - _D :] = size, accel, self._accel_mps2, *ages
         self.accel_mps2 = accel - float(self.filter.mean[_ACCEL_BIAS])
         return inputs
 
     def _variance(self, given: Mapping[str, float], rates_mps2: Array, dt_s: float) -> Array:
         """Return the variance of each measurement.
 
-        A wheel's speed is a mean over a tick, half of one late; a receiver's speed is late by its age where no
-        accelerometer measures what it has changed by.
+        A wheel's speed is a mean over a tick, half of one late.  A receiver's speed is of an age ago; what it has
+        changed by since is that of the low-passed acceleration, which a shaken one is off by, or of none.  (By that of
+        a tick alone the delay would come out short: its error would be in what the delay is multiplied by.)
         """
         std = np.full(MOST_ROWS + 1 + len(_REFERENCES), self._scatter_mps)
         std[: rates_mps2.size] = np.hypot(self._scatter_mps, 0.29 * dt_s * rates_mps2)
-        late_mps = 0.0 if math.isfinite(given["accel_x_mps2"]) else given["gnss_age_s"] * FREE_WALK
+        has_accel = math.isfinite(given["accel_x_mps2"])
+        unknown_mps2 = math.sqrt(self._shaken_square) if has_accel else FREE_WALK
+        late_mps = (given["gnss_age_s"] + float(self.filter.mean[_DELAY])) * unknown_mps2
         fix_m = given["gnss_std_m"] if given["gnss_std_m"] > 0.0 else FLOAT_STD_M
         std[MOST_ROWS:] = (
             *(GYRO_STD_RADPS, fix_m, fix_m, *[math.hypot(GNSS_SPEED_STD_MPS, late_mps)] * 2),
@@ -469,7 +468,9 @@ class SlipFilter(FilterObserver):
             walk[_SLOW : _SLOW + n_slow] = SLOW_WALK**2 + DIRECTION_RATIO**2 * turned / dt_s
             self._pulls = pulls
             walk[_SLOW + n_slow : len(self.states)] = (TURN_WALK * tight) ** 2
-        fast = FAST_RATIO + FAST_PER_MPS2 * float(np.abs(rates_mps2).max()) + FAST_TURNING * tight
+        self._rolled_m = self._rolled_m + size * dt_s if size > STANDING_MPS else 0.0
+        yields = math.exp(-self._rolled_m / (YIELDING_RATIO * self._robot.wheel_radius_m))
+        fast = FAST_RATIO + FAST_PER_MPS2 * float(np.abs(rates_mps2).max()) + FAST_TURNING * tight + yields
         walk[-n_rows:] = _fading(fast**2, FAST_S, dt_s)
         return walk
 
@@ -504,10 +505,12 @@ class SlipFilter(FilterObserver):
         )
         yaw, turn_radps = float(mean[_YAW]), float(mean[_W])
         fix, pose = complex(z[0], z[1]), complex(z[4], z[5])
-        lever, age_s, std_m = complex(*params[_ANTENNA:_POSED]), float(ages_s[0]), given["gnss_std_m"]
+        lever, age_s = complex(*params[_ANTENNA:_POSED]), float(ages_s[0]) + float(mean[_DELAY])
+        std_m = given["gnss_std_m"]
         place, turned, std = fix, math.nan, math.inf
         if math.isfinite(z[6]) and not cmath.isnan(pose):
-            place, lever, age_s, std_m = pose, complex(*params[_POSED:_SEEN]), float(ages_s[1]), POSE_STD_M
+            place, lever, std_m = pose, complex(*params[_POSED:_SEEN]), POSE_STD_M
+            age_s = float(ages_s[1]) + float(mean[_DELAY])
             turned, std = z[6] - yaw + age_s * turn_radps, POSE_STD_RAD
         elif math.isfinite(z[7]) and not cmath.isnan(fix):
             turned, std = z[7] - yaw, COMPASS_STD_RAD
@@ -520,13 +523,16 @@ class SlipFilter(FilterObserver):
         z[:8] = math.nan
         if not std <= math.hypot(ALIGNED_RAD, CRAB_RAD):
             return z
-        if not cmath.isnan(place):
-            rotated = cmath.exp(1j * turned)
-            origin = place + (age_s * velocity - lever * forward) * rotated
-            mean[_X], mean[_Y] = origin.real, origin.imag
         cov[:3, :], cov[:, :3] = 0.0, 0.0
         mean[_YAW], cov[_YAW, _YAW] = wrapped(yaw + turned), std**2
+        moved = velocity * cmath.exp(1j * turned)
         cov[_X, _X] = cov[_Y, _Y] = (std_m if std_m > 0.0 else POSE_STD_M) ** 2 + (abs(lever) * std) ** 2
+        if not cmath.isnan(place):  # of an instant that is as uncertain as the delay
+            origin = place + age_s * moved - lever * forward * cmath.exp(1j * turned)
+            mean[_X], mean[_Y] = origin.real, origin.imag
+            along = np.array([moved.real, moved.imag])
+            cov[:2, :2] += cov[_DELAY, _DELAY] * np.outer(along, along)
+            cov[:2, _DELAY] = cov[_DELAY, :2] = cov[_DELAY, _DELAY] * along
         self._is_placed = True
         return z
 
