@@ -95,8 +95,9 @@ POSE_STD_M, POSE_STD_RAD, COMPASS_STD_RAD, CAMERA_STD_MPS, GNSS_SPEED_STD_MPS = 
 """Of measurements whose own deviation is not given; of poses at first."""
 LEAST_POSE_STD_M, LEAST_POSE_STD_RAD, N_POSES, POSES_FORGOTTEN = 5e-4, 5e-4, 20, 100
 """Of the scatter of poses: the least, what the first value counts as, and how many poses are remembered."""
-DELAY_S, DELAY_STD_S = 0.05, 0.05
-"""Of fixes behind their stamps, at first: some are stamped when they are measured, some when they arrive."""
+DELAY_S, DELAY_STD_S, KNOWN_STD_S = 0.07, 0.07, 0.02
+"""Of fixes behind their stamps, at first: some are stamped when they are measured, some when they arrive; and deviation
+of one that a description has by logs."""
 ALIGNED_RAD, CRAB_RAD, LOST_RAD = 0.05, 0.05, 0.6
 """Deviation at which a heading by the motion is used; that of the motion from the heading; and one that is lost."""
 LEAST_TRAVEL_M, LEAST_RATIO = 0.5, 0.3
@@ -142,7 +143,7 @@ _REFERENCES = (
     *("gnss_x_m", "gnss_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps"),
     *("pose_x_m", "pose_y_m", "pose_yaw_rad", "compass_rad", "camera_x_mps", "camera_y_mps"),
 )
-_DELAYS = ("pose_delay_s", "lidar_delay_s", "gnss_delay_s")  # of a description, by logs
+_DELAYS = {0: ("gnss_delay_s",), 4: ("pose_delay_s", "lidar_delay_s"), 8: ("lidar_delay_s",)}
 _AGE_ROWS = ("gnss_age_s", "pose_age_s", "camera_age_s")
 _INERTIAL = ("yaw_rate_radps", "accel_x_mps2", "pitch_rad")
 
@@ -297,8 +298,6 @@ class SlipFilter(FilterObserver):
         steer = tuple(f"steer_{name}_rad" for name in robot.steered_wheels)
         self.rows = (*self._speeds, *steer, *_INERTIAL, *_REFERENCES, *_AGE_ROWS, "gnss_std_m")
         self._scatter_mps = float(np.fmax(wheel_speed_scatter_mps(robot), WHEEL_STD_MPS))
-        known_s = [robot.identified[name] for name in _DELAYS if name in robot.identified]
-        delay_s, delay_std_s = (known_s[0], 0.3 * DELAY_STD_S) if known_s else (DELAY_S, DELAY_STD_S)
         effective_m = robot.identified.get("effective_track_m")
         loss, loss_std = (0.4, 0.25) if robot.skids else (0.0, 0.15)
         if robot.skids and effective_m is not None:
@@ -330,14 +329,14 @@ class SlipFilter(FilterObserver):
             process_variance=np.zeros(len(self.states) + n_rows),
             measurement_variance=np.ones(MOST_ROWS + 1 + len(_REFERENCES)),
             initial_variance=np.square(
-                [1e-3, 1e-3, 1e-3, 1.0, 0.1, 0.5, BIAS_STD_RADPS, UNTILTED_STD, delay_std_s]
+                [1e-3, 1e-3, 1e-3, 1.0, 0.1, 0.5, BIAS_STD_RADPS, UNTILTED_STD, DELAY_STD_S]
                 + [SLOW_RATIO] * n_slow
                 + [FORCE_SLIP_STD]
                 + [loss_std] * turns
                 + [FAST_RATIO] * n_rows
             ),
             initial_mean=np.array(
-                [0.0] * _DELAY + [delay_s] + [0.0] * n_slow + [FORCE_SLIP] + [loss] * turns + [0.0] * n_rows
+                [0.0] * _DELAY + [DELAY_S] + [0.0] * n_slow + [FORCE_SLIP] + [loss] * turns + [0.0] * n_rows
             ),
             inputs=_INPUTS,
             references=("pose", "gnss_position", "gnss_speed", "camera"),
@@ -350,6 +349,7 @@ class SlipFilter(FilterObserver):
         self._rolling, self._steer = rolling_matrix(*place)[logged], steer
         self._smooth_mps, self._accel_mps2, self._shaken_square = np.full(len(logged), np.nan), math.nan, 0.0
         self._pulls, self._accel_is_wrong, self._rolled_m = np.zeros(len(logged)), False, 0.0
+        self._has_delay = False
         self._force = 0.0  # specific force ahead, low-passed
         bounds = [
             DELAY_BOUNDS_S,
@@ -382,6 +382,7 @@ class SlipFilter(FilterObserver):
         gyro = given["yaw_rate_radps"]
         references = self._place(given, inputs)
         z = np.concatenate([z, [gyro if abs(gyro) <= MOST_RADPS else np.nan], references])
+        self._begin_delay(given)
         self._take_pose(given)
         variance = self._variance(given, rates_mps2, dt_s)
         fix = self.advance(dt_s, z, inputs, self._walk(given, inputs, rates_mps2, dt_s), variance, N_JUDGED)
@@ -491,6 +492,19 @@ class SlipFilter(FilterObserver):
         fast = FAST_RATIO + FAST_PER_MPS2 * float(np.abs(rates_mps2).max()) + FAST_TURNING * tight + yields
         walk[-n_rows:] = _fading(fast**2, FAST_S, dt_s)
         return walk
+
+    def _begin_delay(self, given: Mapping[str, float]) -> None:
+        """Begin with the delay that the description has of what measures the motion first."""
+        if self._has_delay:
+            return
+        for first, names in _DELAYS.items():
+            if math.isfinite(given[_REFERENCES[first]]):
+                self._has_delay = True
+                if known := [
+                    self._robot.identified[name] for name in names if name in self._robot.identified
+                ]:
+                    self.filter.mean[_DELAY], self.filter.cov[_DELAY, _DELAY] = known[0], KNOWN_STD_S**2
+                return
 
     def _take_pose(self, given: Mapping[str, float]) -> None:
         """Learn how much poses scatter."""

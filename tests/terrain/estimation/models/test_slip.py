@@ -1,0 +1,282 @@
+"""The slip filter: its equations, headings by motion, delays, what is not observed, and simulated robots."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from terrain.angles import wrapped
+from terrain.estimation.live import live_estimator
+from terrain.estimation.models import slip as module
+from terrain.estimation.models.choice import suitable_filter
+from terrain.estimation.models.observer import ObserverStatus, observe
+from terrain.estimation.models.slip import SlipFilter, rows_of_wheels
+from terrain.estimation.observe import observe_run, summarize_observer
+from terrain.kinematics.wheels import rolling_matrix
+from terrain.logs.replay import replay as replayed
+from terrain.robots import SkidSteerRobot, load_robot
+from terrain.simulation.run import simulate_run
+from terrain.simulation.sensors import Gnss
+from terrain.terramechanics.soil import soil_names
+
+HUSKY, CAR, OMNI, TRUCK, SWERVE = map(load_robot, ("husky", "adap2e", "robotino", "pallet_truck", "agrimaro"))
+MINE = SkidSteerRobot("mine", 0.2, 0.7, 0.8, 120.0)
+DRIVES = (HUSKY, load_robot("marmotte"), OMNI, load_robot("omnirobot"), CAR, TRUCK, SWERVE)
+PERIOD_S = 0.02
+
+
+def drive(robot, n=1500, slip=0.1, yaw_rad=0.0, backward=False, delay_s=0.0, lever_m=(0.0, 0.0), accel=True):
+    """Return stamps, rows by name and the true motion of a robot whose wheels all slip by a ratio, without noise.
+
+    It speeds up and slows down, and turns where its drive lets it; a receiver gives every fifth tick where the antenna
+    was a delay before.
+    """
+    time_s = PERIOD_S * np.arange(n)
+    fine_s = np.arange(0.0, time_s[-1] + 1e-9, 1e-3)
+    speed = 0.8 + 0.3 * np.sin(0.7 * fine_s)
+    turn = 0.2 * np.sin(0.45 * fine_s)
+    across = 0.2 * np.sin(0.3 * fine_s) if robot.sideways else np.zeros(len(fine_s))
+    if backward:
+        speed = -speed
+    heading = yaw_rad + 1e-3 * np.concatenate([[0.0], np.cumsum(0.5 * (turn[1:] + turn[:-1]))])
+    velocity = (speed + 1j * across) * np.exp(1j * heading)
+    place = 1e-3 * np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]))])
+    antenna = place + complex(*lever_m) * np.exp(1j * heading)
+    at = {
+        name: np.interp(time_s, fine_s, value) for name, value in (("vx", speed), ("vy", across), ("w", turn))
+    }
+    rows = {}
+    twist = np.column_stack([at["vx"], at["vy"], at["w"]])
+    logged, across_wheels, _ = rows_of_wheels(robot)
+    directions = np.tile(robot.wheel_directions_rad, (n, 1))
+    for k in across_wheels.tolist():
+        x_m, y_m = robot.wheel_positions_m[k]
+        angle = np.arctan2(at["vy"] + at["w"] * x_m, at["vx"] - at["w"] * y_m)
+        angle = wrapped(angle + np.pi * (np.abs(angle) > 0.5 * np.pi))
+        directions[:, k] += angle
+        rows[f"steer_{robot.wheels[k]}_rad"] = angle
+    rolling = rolling_matrix(robot.wheel_positions_m, directions, robot.roller_angles_rad)
+    ground = np.einsum("nij,nj->ni", rolling, twist)
+    for k in logged.tolist():
+        rows[f"speed_{robot.wheels[k]}_mps"] = ground[:, k] / (1.0 - slip)
+    rows["yaw_rate_radps"] = at["w"]
+    if accel:
+        rows["accel_x_mps2"] = np.gradient(at["vx"], time_s) - at["w"] * at["vy"]
+        rows["pitch_rad"] = np.zeros(n)
+    then = np.arange(0, n, 5)
+    seen_s = np.maximum(time_s[then] - delay_s, 0.0)
+    rows |= {
+        name: np.full(n, np.nan) for name in ("gnss_x_m", "gnss_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps")
+    }
+    moved = np.gradient(antenna, 1e-3)
+    for name, value in (
+        ("gnss_x_m", antenna.real),
+        ("gnss_y_m", antenna.imag),
+        ("gnss_speed_x_mps", moved.real),
+    ):
+        rows[name][then] = np.interp(seen_s, fine_s, value)
+    rows["gnss_speed_y_mps"][then] = np.interp(seen_s, fine_s, moved.imag)
+    rows["gnss_age_s"], rows["gnss_std_m"] = np.zeros(n), np.full(n, 0.02)
+    true = {"yaw": np.interp(time_s, fine_s, heading), "x": np.interp(time_s, fine_s, place.real), **at}
+    return time_s, rows, true
+
+
+def run_filter(robot, time_s, rows, start=0):
+    """Return the filter, and its track over rows by name; what is not given is unknown."""
+    filter_ = SlipFilter(robot)
+    table = np.column_stack([rows.get(name, np.full(len(time_s), np.nan)) for name in filter_.rows])
+    return filter_, observe(filter_, time_s[start:], table[start:])
+
+
+# -- laws ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("robot", DRIVES, ids=lambda robot: robot.name)
+@pytest.mark.parametrize("backward", [False, True])
+def test_slip_of_any_drive_is_that_of_its_definition(robot, backward):
+    time_s, rows, true = drive(robot, backward=backward, yaw_rad=2.5)
+    _, track = run_filter(robot, time_s, rows)
+    speeds = np.column_stack([rows[name] for name in rows if name.startswith("speed_")])
+    late = (time_s > 15.0)[:, None] & (np.abs(speeds) > 0.3)
+    expected = 0.1 * np.sign(speeds)
+    assert np.abs(track.slip - expected)[late].max() < 0.03
+    assert np.abs(wrapped(track.state("yaw_rad") - true["yaw"]))[time_s > 15.0].max() < 0.06
+    assert (track.status[time_s > 15.0] == ObserverStatus.OK).all()
+
+
+def test_a_wheel_that_stands_tells_the_ground_stands_and_nothing_of_its_slip():
+    time_s, rows, _ = drive(HUSKY)
+    stop = time_s > 20.0
+    for name in ("speed_left_mps", "speed_right_mps", "yaw_rate_radps", "accel_x_mps2"):
+        rows[name] = np.where(stop, 0.0, rows[name])
+    for name in ("gnss_x_m", "gnss_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps"):
+        rows[name] = np.where(stop, np.nan, rows[name])
+    _, track = run_filter(HUSKY, time_s, rows)
+    before, after = np.searchsorted(time_s, [20.0, 29.0])
+    assert abs(track.state("speed_x_mps")[after]) < 0.01
+    assert track.status[after] == ObserverStatus.STANDING
+    assert np.isnan(track.slip[after]).all()
+    for side in ("left", "right"):
+        name = f"ground_slip_{side}_ratio"
+        assert track.state(name)[after] == pytest.approx(track.state(name)[before], abs=0.02)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.1, 0.2])
+def test_a_delay_of_the_receiver_is_learned_and_leaves_slip_as_it_is(delay_s):
+    time_s, rows, _ = drive(MINE, n=3000, delay_s=delay_s)
+    _, track = run_filter(MINE, time_s, rows)
+    std_s = track.std[-1, track.states.index("fix_delay_s")]
+    assert track.state("fix_delay_s")[-1] == pytest.approx(delay_s, abs=3.0 * std_s)
+    assert std_s < 0.03
+    assert np.abs(track.slip[-1000:] - 0.1).max() < 0.03
+
+
+def test_an_antenna_ahead_and_to_the_left_moves_with_the_body():
+    antenna = replace(MINE, parts=_with_antenna(0.5, 0.3))
+    time_s, rows, true = drive(antenna, lever_m=(0.5, 0.3), yaw_rad=-2.0)
+    _, track = run_filter(antenna, time_s, rows)
+    assert track.state("position_x_m")[-1] == pytest.approx(true["x"][-1], abs=0.1)
+    assert np.abs(track.slip[-500:] - 0.1).max() < 0.03
+
+
+def _with_antenna(x_m, y_m):
+    from terrain.robots import Antenna
+
+    return {"antenna": Antenna(x_m, y_m)}
+
+
+@pytest.mark.parametrize("missing", [("gnss_speed_x_mps", "gnss_speed_y_mps"), ("gnss_x_m", "gnss_y_m")])
+def test_positions_or_speeds_alone_show_the_heading(missing):
+    time_s, rows, true = drive(HUSKY, yaw_rad=3.0)
+    _, track = run_filter(HUSKY, time_s, {name: row for name, row in rows.items() if name not in missing})
+    assert np.abs(wrapped(track.state("yaw_rad") - true["yaw"]))[time_s > 10.0].max() < 0.08
+    assert np.abs(track.slip[time_s > 15.0] - 0.1).max() < 0.04
+
+
+def test_spinning_wheels_show_no_heading_and_slip_that_is_seen_is_one():
+    time_s, rows, _ = drive(HUSKY, n=500)
+    for name in rows:
+        if name.startswith(("gnss_x", "gnss_y", "gnss_speed", "accel", "yaw_rate")):
+            rows[name] = 0.0 * rows[name]
+    filter_, track = run_filter(HUSKY, time_s, rows)
+    assert np.isnan(track.slip).all()
+    assert "heading is not known" in filter_.reason
+    rows["compass_rad"] = np.zeros(len(time_s))
+    _, track = run_filter(HUSKY, time_s, rows)
+    assert np.abs(track.slip[-100:] - 1.0).max() < 0.05
+
+
+# -- what is not observed --------------------------------------------------------------------------------------------
+
+
+def test_without_a_reference_slip_is_unknown_and_the_reason_is_said():
+    time_s, rows, _ = drive(HUSKY, n=300)
+    blind = {name: row for name, row in rows.items() if not name.startswith("gnss")}
+    filter_, track = run_filter(HUSKY, time_s, blind)
+    assert np.isnan(track.slip).all()
+    assert (track.status == ObserverStatus.STARTING).all()
+    assert filter_.reason.startswith("nothing has measured the speed over ground")
+
+
+def test_over_ten_seconds_without_a_reference_slip_of_the_ground_is_remembered_with_a_deviation_that_grows():
+    time_s, rows, _ = drive(HUSKY, n=1500)
+    for name in rows:
+        if name.startswith(("gnss_x", "gnss_y", "gnss_speed")):
+            rows[name] = np.where(time_s > 18.0, np.nan, rows[name])
+    filter_, track = run_filter(HUSKY, time_s, rows)
+    before, after = np.searchsorted(time_s, [18.0, 28.0])
+    assert np.abs(track.slip[before:after] - 0.1).max() < 0.05
+    assert track.slip_std[after].min() > 1.5 * track.slip_std[before].max()
+    assert track.status[after] == ObserverStatus.PREDICTED
+    assert filter_.reference_age_s == pytest.approx(time_s[-1] - 18.0, abs=0.2)
+
+
+def test_an_accelerometer_in_other_units_is_left_out():
+    time_s, rows, _ = drive(HUSKY)
+    rows["accel_x_mps2"] = rows["accel_x_mps2"] + 9.81
+    filter_, track = run_filter(HUSKY, time_s, rows)
+    assert np.isnan(filter_.accel_mps2)
+    assert np.abs(track.slip[-300:] - 0.1).max() < 0.05
+
+
+def test_the_scatter_of_poses_is_learned():
+    rng, n = np.random.default_rng(3), 1500
+    time_s, rows, truth = drive(OMNI, n=n)
+    rows = {name: row for name, row in rows.items() if not name.startswith("gnss")}
+    speed = (truth["vx"] + 1j * truth["vy"]) * np.exp(1j * truth["yaw"])
+    place = PERIOD_S * np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]))])
+    for name, value, std in (
+        ("pose_x_m", place.real, 2e-3),
+        ("pose_y_m", place.imag, 2e-3),
+        ("pose_yaw_rad", truth["yaw"], 4e-3),
+    ):
+        rows[name] = value + std * rng.standard_normal(n)
+    rows["pose_age_s"] = np.zeros(n)
+    filter_, track = run_filter(OMNI, time_s, rows)
+    assert np.sqrt(filter_._pose_square) == pytest.approx([2e-3, 4e-3], rel=0.3)
+    known = np.isfinite(track.slip[-500:])
+    speeds = np.column_stack([rows[name] for name in rows if name.startswith("speed_")])[-500:]
+    assert np.abs(track.slip[-500:] - 0.1 * np.sign(speeds))[known & (np.abs(speeds) > 0.3)].max() < 0.05
+
+
+def test_the_filter_that_suits_is_chosen_by_what_is_measured():
+    assert suitable_filter(HUSKY, ("wheels", "imu")) == "skid"
+    assert suitable_filter(CAR, ("wheels", "steering", "gnss")) == "slip"
+    assert suitable_filter(OMNI, ("wheels",)) == "slip"
+    assert suitable_filter(SWERVE, ("wheels", "steering", "imu", "odometry")) == "vio15"
+    only = replace(HUSKY, filters=("skid",))
+    assert suitable_filter(only, ("gnss",)) == "skid"
+
+
+# -- simulated robots ------------------------------------------------------------------------------------------------
+
+
+def coverage(found, robot, least_mps=0.2):
+    """Return mean error, root mean square error and coverage of 95 % intervals of slips, where the wheels turn."""
+    track, truth = found.track, found.run.streams["truth"]
+    errors, inside = [], []
+    for k, name in enumerate(track.slips):
+        wheel = name.removeprefix("slip_").removesuffix("_ratio")
+        at_s = track.time_s - robot.encoder_lag_s
+        true = np.interp(at_s, truth.time_s, truth.channel(name))
+        speed = robot.wheel_radius_m * np.interp(at_s, truth.time_s, truth.channel(f"wheel_{wheel}_radps"))
+        error = track.slip[:, k] - true
+        known = np.isfinite(error) & (np.abs(speed) > least_mps)
+        errors.append(error[known])
+        inside.append(np.abs(error[known]) < 1.96 * track.slip_std[known, k])
+    errors, inside = np.concatenate(errors), np.concatenate(inside)
+    return errors.mean(), np.sqrt(np.mean(errors**2)), inside.mean()
+
+
+def test_live_equals_log_and_a_robot_of_four_numbers_has_its_slip():
+    run = simulate_run(MINE, "grass", "survey", 11, duration_s=20.0, gnss=Gnss())
+    found = observe_run(run, MINE, "slip")
+    mean, _, inside = coverage(found, MINE)
+    assert abs(mean) < 0.02
+    assert inside > 0.85
+    assert summarize_observer(found).reason == ""
+    channels = {name: stream.channels for name, stream in run.streams.items()}
+    live = live_estimator(MINE, channels)
+    assert live.name == "slip"
+    estimates = [estimate for sample in replayed(run) for estimate in live.step(sample.readings)]
+    estimates += live.settle(all_of_them=True)
+    np.testing.assert_array_equal([estimate.slip_ratio for estimate in estimates], found.track.slip)
+    np.testing.assert_array_equal([estimate.slip_std for estimate in estimates], found.track.slip_std)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("soil", soil_names()[:6])
+def test_mean_slip_of_a_skid_steer_robot_with_a_receiver_is_within_a_hundredth(soil):
+    means, inside = [], []
+    for seed in range(91500, 91505):
+        run = simulate_run(MINE, soil, "survey", seed, duration_s=60.0, vary=True, gnss=Gnss())
+        mean, _, covered = coverage(observe_run(run, MINE, "slip"), MINE)
+        means.append(mean)
+        inside.append(covered)
+    assert np.abs(means).max() < 0.02
+    assert abs(np.mean(means)) < 0.01
+    assert 0.90 < np.mean(inside) <= 0.995
+
+
+def test_constants_that_docs_name_are_there():
+    assert module.UNKNOWN_RATIO == 0.25
