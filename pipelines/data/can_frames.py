@@ -31,15 +31,17 @@ from terrain.errors import ConfigError, LogError, one_line
 from terrain.files.documents import read_yaml
 from terrain.files.names import data_folder
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
+from terrain.kinematics.logged_wheels import sensor_channels
 from terrain.logs.parts import Assembler, Part
 from terrain.logs.samples import checked_stream, whole_run_label
-from terrain.logs.schema import UNIT_SCALES, canonical_unit, check_unit, unit_of
+from terrain.logs.schema import TWIST, UNIT_SCALES, canonical_unit, check_unit, unit_of
 from terrain.records import Reading, RunLog
+from terrain.robots import Robot
 
 if TYPE_CHECKING:
     from can import Message as Frame
 
-DEFAULT_DBC = "agrimaro.dbc"
+DEFAULT_DBC, SKIDDING_DBC = "agrimaro.dbc", "skid_steer.dbc"
 MAX_BYTES = 8
 UNITLESS = ("", "-", "1")  #: Units of a code
 
@@ -54,12 +56,62 @@ SIGNALS: Mapping[str, Mapping[str, str]] = read_yaml(data_folder("can") / "signa
 """Signal of each channel, by stream; the channels are in the order of its columns."""
 
 RECEIVED = ("wheels", "steering", "imu", "odometry", "twist")
-"""Streams that the bridge receives, the last of them desired and not measured; it sends the others."""
+"""Streams of AgriMaRo that the bridge receives, the last of them desired and not measured; it sends the others."""
+
+SENT = ("corrections", "command", "status")
+"""Streams that the bridge sends: corrections of the wheels' rates, the twist to drive, and what it does."""
 
 OPTIONAL = frozenset(
     (*(f"position_{axis}_m" for axis in "xyz"), "quaternion_w_ratio", "confidence_ratio", *SIGNALS["status"])
 )
 """Channels that no controller needs, or that follow from others: a DBC may lack them."""
+
+COMMANDED = ("CommandedSpeedX", "CommandedSpeedY", "CommandedYawRate")
+"""Signals of the twist to drive, for a controller of a robot of another drive that takes one."""
+
+_WORDS = {"motor": "MotorRate", "speed": "WheelSpeed", "current": "MotorCurrent", "angle": "SteeringAngle"}
+_OF_STREAM = {"odometry": "Ground", "gnss": "Gnss"}
+
+
+def signals_of(robot: Robot | None = None) -> Mapping[str, Mapping[str, str]]:
+    """Return the signal of each channel of a robot, by stream; of a swerve robot, and without one, :data:`SIGNALS`.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> signals = signals_of(load_robot("husky"))
+    >>> list(signals["wheels"].values())
+    ['WheelSpeedLeft', 'WheelSpeedRight', 'MotorCurrentLeft', 'MotorCurrentRight']
+    >>> list(signals["corrections"].values())
+    ['CorrectionLeft', 'CorrectionRight']
+    >>> signals["gnss"]["velocity_x_mps"], signals["odometry"]["speed_x_mps"]
+    ('GnssVelocityX', 'GroundSpeedX')
+    """
+    if robot is None or robot.drive == "swerve":
+        return SIGNALS
+    found: dict[str, Mapping[str, str]] = {}
+    for stream, channels in sensor_channels(robot).items():
+        if stream == "imu":
+            found[stream] = SIGNALS[stream]
+            continue
+        named = {channel: channel.rpartition("_")[0].split("_") for channel in channels}
+        found[stream] = {
+            channel: _OF_STREAM.get(stream, "")
+            + "".join(_word(stream, at, part) for at, part in enumerate(parts))
+            for channel, parts in named.items()
+        }
+    corrections = {f"correction_{wheel}_radps": f"Correction{_name(wheel)}" for wheel in robot.logged_wheels}
+    own = {"corrections": corrections, "command": dict(zip(TWIST, COMMANDED, strict=True))}
+    return {**found, "twist": SIGNALS["twist"], **own, "status": SIGNALS["status"]}
+
+
+def _word(stream: str, at: int, part: str) -> str:
+    return _WORDS.get(part, _name(part)) if at == 0 and stream in ("wheels", "steering") else _name(part)
+
+
+def _name(wheel: str) -> str:
+    return wheel.title().replace("_", "")
+
 
 QUATERNION = tuple(CAMERA_CHANNELS.index(f"quaternion_{part}_ratio") for part in "xyzw")
 """Columns of the camera's quaternion; a real part that the DBC lacks is the one that is not negative."""
@@ -126,19 +178,29 @@ class Layout:
     name: str
     by_key: Mapping[tuple[int, bool], MessagePlan]
     by_stream: Mapping[str, Sequence[MessagePlan]]
+    signals: Mapping[str, Mapping[str, str]]  #: of the robot, as :func:`signals_of` has them
+
+    @property
+    def received(self) -> tuple[str, ...]:
+        """Streams that the bridge receives, the last of them the desired twist."""
+        return tuple(name for name in self.signals if name not in SENT)
 
     def columns(self, stream: str) -> frozenset[int]:
         """Return the columns of a stream that the DBC has."""
         return frozenset(signal.column for plan in self.by_stream.get(stream, ()) for signal in plan.signals)
 
 
-def load_layout(path: str | Path | None = None, *, complete: bool = True) -> Layout:
+def load_layout(
+    path: str | Path | None = None, robot: Robot | None = None, *, complete: bool = True
+) -> Layout:
     """Return what a DBC has of the signals that are used.
 
     Parameters
     ----------
-    path : DBC file; AgriMaRo's by default
-    complete : whether it must have what a pilot needs: all signals but those that may be lacking
+    path : DBC file; AgriMaRo's by default, of robots that skid that of the package
+    robot : whose; a swerve robot by default
+    complete : whether it must have what a pilot needs: all signals but those that may be lacking; of other than swerve
+        robots the wheels' rates, the desired twist, and corrections or the twist to drive
 
     Raises
     ------
@@ -151,10 +213,16 @@ def load_layout(path: str | Path | None = None, *, complete: bool = True) -> Lay
     >>> [plan.message.name for plan in layout.by_stream["wheels"]]
     ['MotorRates', 'MotorCurrents']
     """
-    path = data_folder("can") / DEFAULT_DBC if path is None else Path(path)
+    named = signals_of(robot)
+    if path is None and named is not SIGNALS and robot is not None and not robot.skids:
+        raise ConfigError(
+            f"robot {robot.name}: no DBC of drive {robot.drive!r} is packaged, give one with --dbc"
+        )
+    default = DEFAULT_DBC if named is SIGNALS else SKIDDING_DBC
+    path = data_folder("can") / default if path is None else Path(path)
     places = {
         name: (stream, column, channel)
-        for stream, names in SIGNALS.items()
+        for stream, names in named.items()
         for column, (channel, name) in enumerate(names.items())
     }
     cantools = library("cantools")
@@ -201,13 +269,17 @@ def load_layout(path: str | Path | None = None, *, complete: bool = True) -> Lay
             crc_bits = int.from_bytes(message.encode(raw, scaling=False, padding=False, strict=False), "big")
         plan = MessagePlan(message, carried[0], signals, counter_bits, crc_bits, others)
         by_stream.setdefault(carried[0], []).append(plan)
-    missing = [name for name, place in places.items() if name not in owner and place[2] not in OPTIONAL]
+    required = [name for name, place in places.items() if place[2] not in OPTIONAL]
+    if robot is not None and named is not SIGNALS:
+        required = [named["wheels"][rate] for rate in robot.rate_channels] + [*named["twist"].values()]
+        required += () if "command" in by_stream else named["corrections"].values()
+    missing = [name for name in required if name not in owner]
     if complete and missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise ConfigError(f"{path}: lacks the signal {missing[0]!r}{more}; docs/can.md lists those required")
     plans = [plan for of_stream in by_stream.values() for plan in of_stream]
     by_key = {(plan.message.frame_id, plan.message.is_extended_frame): plan for plan in plans}
-    return Layout(path.name, by_key, by_stream)
+    return Layout(path.name, by_key, by_stream, named)
 
 
 def _signal_plan(path: Path, signal: Any, column: int, channel: str) -> SignalPlan:
@@ -370,8 +442,9 @@ class Receiver:
         for name in streams:
             if name in layout.by_stream:
                 columns = layout.columns(name)
-                quaternion = QUATERNION if name == "odometry" and QUATERNION[3] not in columns else ()
-                about = len(SIGNALS[name]), columns, self.dropped, most, quaternion
+                seen = name == "odometry" and layout.signals is SIGNALS
+                quaternion = QUATERNION if seen and QUATERNION[3] not in columns else ()
+                about = len(layout.signals[name]), columns, self.dropped, most, quaternion
                 self._streams[name] = Assembler(name, *about)
 
     def take(self, frame: Frame) -> str | None:
@@ -422,7 +495,7 @@ def read_run(path: Path, folder: Path, layout: Layout, robot: str, *, repair: bo
     LogError
         if the log cannot be read, has none of the signals, or is damaged.
     """
-    receiver = Receiver(layout, tuple(SIGNALS), most=math.inf)
+    receiver = Receiver(layout, tuple(layout.signals), most=math.inf)
     first_s: float | None = None
     for frame in _frames(path):
         first_s = frame.timestamp if first_s is None else first_s
@@ -435,10 +508,11 @@ def read_run(path: Path, folder: Path, layout: Layout, robot: str, *, repair: bo
         raise LogError(f"{path}: {n} of kind {kind!r}; read it with --repair to leave them out")
     streams = {}
     for name in readings:
-        if name not in RECEIVED:
+        if name not in layout.received:
             continue
-        columns = sorted(layout.columns(name) | ({QUATERNION[3]} if name == "odometry" else set()))
-        channels = tuple(SIGNALS[name])
+        seen = name == "odometry" and layout.signals is SIGNALS
+        columns = sorted(layout.columns(name) | ({QUATERNION[3]} if seen else set()))
+        channels = tuple(layout.signals[name])
         streams["commands" if name == "twist" else name] = checked_stream(
             f"{path}, {name}",
             readings[name].time_s,

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.data.can_frames import RECEIVED, SIGNALS, Layout, Receiver, encode, library, load_layout
+from pipelines.data.can_frames import Layout, Receiver, encode, library, load_layout
 from pipelines.live.chain import Chain, CommandStatus
 from pipelines.live.session import chain_of
 from pipelines.report.numbers import format_value
@@ -31,7 +31,7 @@ from terrain.control.wheel_corrections import BridgeState, LowLevelKinematics, c
 from terrain.errors import ConfigError, one_line
 from terrain.estimation.clocks import SessionClock
 from terrain.records import Array, Sample
-from terrain.robots import SwerveRobot, as_drive, load_robot
+from terrain.robots import Robot, load_robot
 
 if TYPE_CHECKING:
     from can import Message as Frame
@@ -158,8 +158,8 @@ class Bridge:
     Parameters
     ----------
     layout : of the DBC
-    robot : a swerve robot
-    chain : gives the commands; begins where the steering is measured first
+    robot : whose wheels
+    chain : gives the commands; of a swerve robot begins where the steering is measured first
 
     Attributes
     ----------
@@ -168,12 +168,13 @@ class Bridge:
     frames_in, samples, states, clipped, ticks_missed, duration_s : as it has them
     """
 
-    def __init__(self, layout: Layout, robot: SwerveRobot, chain: Chain) -> None:
+    def __init__(self, layout: Layout, robot: Robot, chain: Chain) -> None:
         self._layout, self._chain = layout, chain
-        self.receiver = Receiver(layout, RECEIVED)
+        self.receiver = Receiver(layout, layout.received)
         self._robot, self._zeros_rad = robot, robot.steering_zeros_rad
+        self._driven = np.isin(robot.wheels, robot.logged_wheels)
         self._kinematics: LowLevelKinematics | None = None
-        self._clock, self._last = SessionClock(), last_samples()
+        self._clock, self._last = SessionClock(), last_samples(robot.drive == "swerve")
         self._before_s, self._counter, self._new_wheels = math.nan, 0, False
         self._stopped = threading.Event()
         self.frames_in = self.ticks_missed = 0
@@ -227,7 +228,8 @@ class Bridge:
                 due_s += late * period_s
         finally:
             self.duration_s = clock() - start_s
-            link.send(self._frames(np.zeros(3), {}, BridgeState.STOPPED, self._clock.at(clock())))
+            none = np.zeros(len(self._driven))
+            link.send(self._frames(none, np.zeros(3), {}, BridgeState.STOPPED, self._clock.at(clock())))
             link.close()
 
     def receive(self, frame: Frame, read_s: float) -> None:
@@ -244,48 +246,61 @@ class Bridge:
         new = {name: last.take(readings.get(name), read_s) for name, last in self._last.items()}
         self._new_wheels = new["wheels"]
         readings.pop("twist", None)
-        added, status, state = self._control(Sample(now_s, np.zeros(3), readings), read_s)
+        sent = self._control(Sample(now_s, np.zeros(3), readings), read_s)
         self._before_s = now_s
-        self.states[state.name] += 1
-        return self._frames(added, status, state, now_s)
+        self.states[sent[-1].name] += 1
+        return self._frames(*sent, now_s)
 
     def sent(self, read_s: float) -> None:
         """Note when the frames of the last step were sent."""
         if self._new_wheels:
             self.latencies_s.append(self._clock.at(read_s) - self._last["wheels"].stamp_s)
 
-    def _control(self, sample: Sample, read_s: float) -> tuple[Array, Mapping[str, float], BridgeState]:
-        """Return corrections, the controller's status, and the state."""
+    def _control(
+        self, sample: Sample, read_s: float
+    ) -> tuple[Array, Array, Mapping[str, float], BridgeState]:
+        """Return corrections, the twist to drive, the controller's status, and the state.
+
+        Where corrections are not the controller's, the twist is the desired one while it is fresh, and 0 else.
+        """
         states = {name: last.state(sample.time_s, read_s) for name, last in self._last.items()}
         state = next((each for each in states.values() if each != BridgeState.ACTIVE), BridgeState.ACTIVE)
-        measured_rad = self._last["steering"].values - self._zeros_rad
+        none, is_swerve = np.zeros(len(self._driven)), self._robot.drive == "swerve"
+        measured_rad = self._last["steering"].values - self._zeros_rad if is_swerve else none
+        desired = self._last["twist"].values if states["twist"] == BridgeState.ACTIVE else np.zeros(3)
         if np.isnan(measured_rad).any():  # it never came
-            return np.zeros(3), {}, state
+            return none, desired, {}, state
         if self._kinematics is None:
             self._kinematics = LowLevelKinematics(self._robot, measured_rad)
-        if states["twist"] == BridgeState.ACTIVE:
-            sample = sample._replace(twist=self._last["twist"].values)
-        wheel_radps = self._kinematics.step(sample.twist, step_or_period(sample.time_s - self._before_s))
-        done = self._chain.take(sample)
+        sample = sample._replace(twist=desired)
+        wheel_radps = self._kinematics.step(desired, step_or_period(sample.time_s - self._before_s))
+        done, steer_rad = self._chain.take(sample), self._kinematics.steer_rad
         assert done.command is not None  # of a chain that drives
-        added, found = corrections(done.command, wheel_radps, self._kinematics.steer_rad, measured_rad)
+        measured_rad = measured_rad if is_swerve else steer_rad
+        added, found = corrections(done.command, wheel_radps, steer_rad, measured_rad)
         if done.failure:
             self.receiver.dropped[done.failure[:160]] += 1
         found = _NOT_DECIDED.get(done.status, found)
         if state == BridgeState.ACTIVE or found == BridgeState.STEP_FAILED:
             state = found
-        return (added if state == BridgeState.ACTIVE else np.zeros(3)), done.command.status, state
+        if state != BridgeState.ACTIVE:
+            return none, desired, done.command.status, state
+        return added, done.command.twist, done.command.status, state
 
     def _frames(
-        self, added: Array, status: Mapping[str, float], state: BridgeState, now_s: float
+        self, added: Array, twist: Array, status: Mapping[str, float], state: BridgeState, now_s: float
     ) -> list[Frame]:
         figures = {**status, "bridge_code": float(state)}
         known = {name: v for name, v in figures.items() if v >= 0.0 or not name.endswith("_code")}
-        values = [known.get(name, math.nan) for name in SIGNALS["status"]]  # a code below zero is none
+        values = [
+            known.get(name, math.nan) for name in self._layout.signals["status"]
+        ]  # a code below zero is none
         counter, self._counter = self._counter, self._counter + 1
+        sent = {"corrections": added[self._driven].tolist(), "command": twist.tolist(), "status": values}
         return [
-            *encode(self._layout, "corrections", added.tolist(), counter, now_s, self.clipped),
-            *encode(self._layout, "status", values, counter, now_s, self.clipped),
+            frame
+            for stream, numbers in sent.items()
+            for frame in encode(self._layout, stream, numbers, counter, now_s, self.clipped)
         ]
 
 
@@ -327,14 +342,14 @@ class BridgeResult(Result):
 def run(settings: Settings, progress: Progress = silent) -> BridgeResult:
     """Run a pilot on a bus until it is interrupted, or for the time of the settings."""
     interface, channel = bus_of(settings.can or "")
-    layout = load_layout(settings.dbc)
-    table, pilot = load_slip_table(settings.table), PilotSettings(controller=settings.controller)
-    refusal = "robot {name}: drive {drive!r} has no corrections on a CAN bus, only 'swerve' has"
-    robot = as_drive(SwerveRobot, load_robot(settings.robot or "agrimaro"), refusal)
+    robot, table = load_robot(settings.robot or "agrimaro"), load_slip_table(settings.table)
+    layout, pilot = load_layout(settings.dbc, robot), PilotSettings(controller=settings.controller)
     check_pilot(robot, table, pilot)
+    # of what the DBC has no signal of, nothing is measured
+    measured = [name for name in layout.received[:-1] if robot.drive == "swerve" or layout.columns(name)]
     chain = chain_of(
         robot,
-        {name: tuple(SIGNALS[name]) for name in RECEIVED if name != "twist"},
+        {name: tuple(layout.signals[name]) for name in measured},
         loaded(settings, settings.model),
         table,
         pilot,

@@ -14,9 +14,9 @@ from enum import auto
 import numpy as np
 
 from terrain.angles import wrapped
-from terrain.kinematics.commands import FAR_RAD, wheel_command_step
+from terrain.kinematics.commands import FAR_RAD, wheel_motion
 from terrain.records import Array, Command, Reading
-from terrain.robots import SwerveRobot
+from terrain.robots import Robot
 from terrain.status import StatusCode
 
 AHEAD_S = 0.1  #: A sample whose stamp is further ahead of the time is not built on.
@@ -41,36 +41,32 @@ class BridgeState(StatusCode):
 
 
 class LowLevelKinematics:
-    """The theoretical rates of a swerve robot's wheels, as its low-level kinematics evaluates them.
+    """The theoretical rates of a robot's wheels, as its low-level kinematics evaluates them.
 
-    ``steer_rad`` (3,) is the last command of the steering; at first where it is measured.
+    ``steer_rad`` (wheels,) is the last command of the steering; at first where it is measured.
     """
 
-    def __init__(self, robot: SwerveRobot, steer_rad: Array) -> None:
-        self._positions_m = np.array(robot.wheel_positions_m)
-        motors, steering = robot.motors, robot.steering
-        self._limits = robot.wheel_radius_m, motors.speed_max_radps, steering.rate_max_radps
-        self.steer_rad = np.array(steer_rad, dtype=np.float64)
+    def __init__(self, robot: Robot, steer_rad: Array) -> None:
+        self._robot, self.steer_rad = robot, np.array(steer_rad, dtype=np.float64)
 
     def step(self, twist: Array, dt_s: float) -> Array:
-        """Return the rates (3,) for a twist, and move the steering to within a step."""
-        limits = (*self._limits, dt_s)
-        wheel_radps: Array
-        _, wheel_radps, self.steer_rad = wheel_command_step(self._positions_m, *limits, twist, self.steer_rad)
-        return wheel_radps
+        """Return the rates (wheels,) for a twist, and move the steering to within a step."""
+        found = wheel_motion(self._robot, twist[None], dt_s, self.steer_rad)
+        self.steer_rad = found.steer_rad[0]
+        return np.asarray(found.wheel_radps[0])
 
 
 def corrections(
     command: Command, wheel_radps: Array, steer_rad: Array, measured_rad: Array
 ) -> tuple[Array, BridgeState]:
-    """Return what is to be added to the theoretical rate (3,) of each wheel, and whether it can be.
+    """Return what is to be added to the theoretical rate (wheels,) of each wheel, and whether it can be.
 
     A wheel can follow a velocity at two steering angles half a turn apart, with opposite rates: where the
     measured angle is the other one, the correction changes its sign.  Where it is neither, the low-level
     kinematics is at another command than the one that was computed here, and nothing may be added to it.
 
-    Rates and angles (3,) are those of the desired twist; measured angles have their zeros removed, and are NaN
-    where unknown.
+    Rates and angles (wheels,) are those of the desired twist; measured angles have their zeros removed, and are NaN
+    where unknown; of robots that are not swerve the commanded ones.
 
     Examples
     --------
@@ -82,13 +78,13 @@ def corrections(
     'STEERING'
     """
     if not (np.isfinite(command.wheel_radps).all() and np.isfinite(command.steer_rad).all()):
-        return np.zeros(3), BridgeState.NOT_FINITE
+        return np.zeros_like(wheel_radps), BridgeState.NOT_FINITE
     same_solution = np.where(np.cos(command.steer_rad - steer_rad) < 0.0, -1.0, 1.0)
     added = same_solution * command.wheel_radps - wheel_radps
     apart_rad = np.abs(wrapped(measured_rad - steer_rad))
     to_nearest_rad = np.minimum(apart_rad, np.pi - apart_rad)
     if not (to_nearest_rad <= FAR_RAD).all():  # of NaN too
-        return np.zeros(3), BridgeState.STEERING
+        return np.zeros_like(wheel_radps), BridgeState.STEERING
     return np.where(apart_rad > np.pi / 2, -added, added), BridgeState.ACTIVE
 
 
@@ -126,15 +122,16 @@ class LastSample:
         return BridgeState.ACTIVE if fresh else self._stale
 
 
-def last_samples() -> Mapping[str, LastSample]:
-    """Return what a correction is built on, in the order in which what is missing is named.
+def last_samples(steered: bool = True) -> Mapping[str, LastSample]:
+    """Return what a correction is built on, in the order in which what is missing is named; steering where it counts.
 
     Nothing older than ten samples of twist and steering, and five of the wheels at 50 Hz, is built on; 0.1 s at
     1 m/s are 0.1 m.
     """
     state = BridgeState
-    return {
+    last = {
         "twist": LastSample(0.2, state.NO_TWIST, state.STALE_TWIST),
         "wheels": LastSample(0.1, state.NO_WHEELS, state.STALE_WHEELS, whole=False),
         "steering": LastSample(0.2, state.STEERING, state.STEERING),
     }
+    return last if steered else {name: last[name] for name in ("twist", "wheels")}

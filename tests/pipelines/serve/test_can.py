@@ -26,6 +26,7 @@ from terrain.control.robot_control import PERIOD_S, PilotSettings
 from terrain.control.slip_table import load_slip_table
 from terrain.control.wheel_corrections import BridgeState
 from terrain.errors import ConfigError
+from terrain.files.names import data_folder
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
@@ -399,3 +400,65 @@ def test_with_a_pilot_corrections_are_what_it_commands_beyond_plain_kinematics(f
     np.testing.assert_allclose(added, expected[1:301], atol=RESOLUTION_RADPS)
     assert np.abs(added).max() > 1.0
     assert set(states) == {ACTIVE}
+
+
+HUSKY = load_robot("husky")
+SKIDDING = load_layout(None, HUSKY)
+
+
+def husky_bridge(controller="traction"):
+    return Bridge(SKIDDING, HUSKY, LivePilot(HUSKY, TABLE, settings=PilotSettings(controller=controller)))
+
+
+def husky_frames(twist=(0.5, 0.0, 0.3), until_s=2.0, rates=(0.4, 0.6)):
+    """Frames of a desired twist, and of wheels, gyro and camera of a robot that drives so."""
+    found = []
+    for k in range(round(until_s / PERIOD_S)):
+        time_s = k * PERIOD_S
+        sent = {"twist": twist, "wheels": (*rates, math.nan, math.nan)}
+        sent |= {"imu": (0.0, 0.0, 0.3, *[math.nan] * 6), "odometry": (0.5, 0.0)}
+        for stream, values in sent.items():
+            found += encode(SKIDDING, stream, values, k, time_s)
+    return found
+
+
+def sent_at_last(bridge, frames, until_s):
+    """What the bridge sent in its last step, by stream."""
+    last = []
+    for k in range(round(until_s / PERIOD_S)):
+        tick_s = (k + 1) * PERIOD_S + 1e-6
+        for frame in frames:
+            if tick_s - PERIOD_S < frame.timestamp <= tick_s:
+                bridge.receive(frame, frame.timestamp)
+        last = bridge.tick(tick_s)
+    parts = [decode(SKIDDING, frame) for frame in last]
+    return {part.stream: list(part.values.values()) for part in parts}
+
+
+def test_a_skid_steer_robot_is_sent_corrections_of_its_sides_and_the_twist_to_drive():
+    plain = sent_at_last(husky_bridge("plain"), husky_frames(), 2.0)
+    assert plain["corrections"] == [0.0, 0.0]
+    assert plain["command"] == pytest.approx([0.5, 0.0, 0.3])
+    assert BridgeState(int(plain["status"][4])) == ACTIVE
+    driven = sent_at_last(
+        husky_bridge(), husky_frames(rates=(0.3, 0.7)), 2.0
+    )  # turns less than its wheels say
+    left, right = driven["corrections"]
+    assert left < 0.0 < right
+    assert driven["command"][2] > 0.31
+
+
+def test_without_what_it_is_built_on_the_twist_of_a_skid_steer_robot_is_the_desired_one_or_none():
+    frames = [frame for frame in husky_frames() if frame.arbitration_id != 0x120]  # no wheels
+    sent = sent_at_last(husky_bridge(), frames, 2.0)
+    assert (sent["corrections"], BridgeState(int(sent["status"][4]))) == ([0.0, 0.0], BridgeState.NO_WHEELS)
+    assert sent["command"] == pytest.approx([0.5, 0.0, 0.3])
+    sent = sent_at_last(husky_bridge(), husky_frames(until_s=1.0), 2.0)  # all end
+    assert (sent["corrections"], sent["command"]) == ([0.0, 0.0], [0.0, 0.0, 0.0])
+
+
+def test_a_drive_without_a_packaged_dbc_needs_its_own():
+    with pytest.raises(ConfigError, match="no DBC of drive 'omni' is packaged, give one with --dbc"):
+        load_layout(None, load_robot("robotino"))
+    with pytest.raises(ConfigError, match="lacks the signal 'MotorRate1' and 2 more"):
+        load_layout(data_folder("can") / "skid_steer.dbc", load_robot("robotino"))
