@@ -111,7 +111,7 @@ from terrain.simulation.contacts import TRACK_PATCHES, Contact, contacts_of
 from terrain.simulation.scenario import Conditions, Faults, Scenario
 from terrain.simulation.sensors import BODY_ROW, STEP_S, Gnss, Motion, Poses
 from terrain.terramechanics.soil import Soil
-from terrain.terramechanics.traction import GROUND, ground_record, wheel_ground
+from terrain.terramechanics.traction import GROUND, ground_record, rolling_resistance, wheel_ground
 
 # Damping of the contact as a lead on its deflection; it vanishes in steady rolling and so moves no slip.
 DEFLECTION_DAMPING_S = 0.005
@@ -142,15 +142,16 @@ PATCH = record({"ground": GROUND, **numbers("roughness_m3 roller_friction_ratio 
 
 CONTACT = record(
     numbers(
-        "x_m y_m radius_m roller_rad direction_rad side_ratio ackermann_m load_fraction ride_ratio ride_roll_1pm "
-        "ride_pitch_1pm"
+        "x_m y_m radius_m roller_rad direction_rad side_ratio ackermann_m in_line_ratio load_fraction ride_ratio "
+        "ride_roll_1pm ride_pitch_1pm"
     )
     | {"load_per_force_ratio": (float, 2), "wheel": int}
 )
 """A contact with the ground of a wheel of the robot: its place and rolling radius; the axis of its rollers from the
 direction that it drives along, and that direction where it is not steered; -1 or 1 for the left or right tyre behind a
-differential; the wheelbase where an axle is steered, so that all its tyres roll about one centre; its share of the
-weight, and what a force along x or y of the body adds to it; what the ride of its corner is of that of the body."""
+differential; the wheelbase where an axle is steered, so that all its tyres roll about one centre; whether it follows
+another; its share of the weight, and what a force along x or y of the body adds to it; what the ride of its corner is
+of that of the body."""
 
 PLANT = record(
     {
@@ -559,6 +560,8 @@ def step(
         thrust, side, resistance, sinkage = wheel_ground(
             ground, normal_n, min(max(slip_x, -1.0), 1.0), slip_y
         )
+        if at.in_line_ratio * along > 0.0:  # the rut is there
+            resistance = rolling_resistance(normal_n, ground.rolling_resistance_ratio)
         thrust *= profile.field[0, c, cell]
         side *= profile.field[0, c, cell]
         resistance *= profile.field[1, c, cell]

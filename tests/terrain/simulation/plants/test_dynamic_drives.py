@@ -150,6 +150,8 @@ def test_steady_slip_is_that_of_the_law_of_the_soil_for_load_and_resistance(robo
     for wheel, share in zip(robot.wheels, shares.tolist(), strict=True):
         slip, normal, traction = end(run, f"slip_{wheel}_ratio", f"normal_{wheel}_n", f"traction_{wheel}_n")
         thrust, _, resistance, _ = np.array(wheel_ground(ground, normal / share, slip, 0.0)) * share
+        if (robot.drive, wheel) == ("bicycle", "rear"):  # in the ruts of the front wheels
+            resistance = normal * flat.rolling_resistance_ratio
         assert traction == pytest.approx(thrust, abs=2e-3 * normal)
         pulled, resisting = pulled + traction, resisting + resistance
     assert pulled == pytest.approx(resisting, rel=0.02)
