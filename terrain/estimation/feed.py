@@ -104,7 +104,7 @@ CRAWL_MPS = 0.1  #: w_0: well below it a slip speed no longer follows the speed 
 REST_AFTER_S = 0.2  #: Time for which nothing has to move.
 #: What counts as nothing, of a wheel's low-passed speed, the gyro, the accelerometer and the camera: biases and noise
 #: at rest stay below, as does a wheel that is held to and fro on soft ground.
-REST_WHEEL_MPS, REST_TURN_RADPS, REST_ACCEL_MPS2, REST_SEEN_MPS = 0.01, 0.03, 0.4, 0.05
+REST_WHEEL_MPS, REST_TURN_RADPS, REST_ACCEL_MPS2, REST_SEEN_MPS = 0.02, 0.03, 0.4, 0.05
 UNSEEN_AFTER_S = 0.15  #: Age of the camera's speed from which on there is none.
 #: Without a camera a change of a wheel's speed counts for so long: the body, and slip, follow it late.
 HELD_S = 0.5
