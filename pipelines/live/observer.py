@@ -13,11 +13,14 @@ import numpy as np
 from pipelines.live.chain import Chain, Step
 from pipelines.live.classifying import Classifier, WindowOutput
 from pipelines.live.model import TerrainModel
-from pipelines.live.windows import live_estimator
+from pipelines.live.windows import live_estimator, needs_filter
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import SWITCHING, SwitchSettings, TerrainBelief, check_switching, drive_on
+from terrain.errors import ConfigError
 from terrain.estimation.clocks import ClockWatch, last_stamp_s
 from terrain.estimation.live import LiveEstimate
+from terrain.estimation.live import live_estimator as suitable_estimator
+from terrain.extension import correct_live
 from terrain.kinematics.logged_wheels import speed_columns
 from terrain.records import Reading, Sample
 from terrain.robots import Robot
@@ -84,7 +87,12 @@ class Observer(Chain):
         self._filter, corrected = None, self._robot
         if self._robot is not None:
             self._filter, corrected = live_estimator(model.info, self._robot, self.channels)
-        name = "" if self._filter is None else self._filter.name
+            if self._filter is None:  # the model does without: for slip and motion alone
+                driven, correction = correct_live(self._robot)
+                with suppress(ConfigError):
+                    self._filter = suitable_estimator(driven, self.channels, correction)
+        self._is_needed = self._filter is not None and needs_filter(model.info, self.channels)
+        name = self._filter.name if self._filter is not None and self._is_needed else ""
         self.source = Classifier(model, self._robot, self._thread, self.channels, name)
         self._speed_columns, self._mps_per_unit = speed_columns(self.channels.get("wheels", ()), corrected)
 
@@ -117,7 +125,8 @@ class Observer(Chain):
                 self._set_up(self.model, named)
         estimates: Sequence[LiveEstimate] = ()
         if self._filter is not None:
-            estimates = self._filter.step(samples)
+            found = self._filter.step(samples)
+            estimates = found if self._is_needed else ()
             self.estimate = self._filter.latest
         if self._clocks.was_set(samples):  # what was believed stays, and its outputs begin anew
             self.source.restart()

@@ -537,6 +537,21 @@ class LiveFilter(Live):
             np.empty(0, np.int8) if self._monitor is None else self._monitor.health.copy(),
             motion,
             float(self._motion["stuck_since_s"][0]),
+            reason=self._reason(slip_ratio, age_s),
+        )
+
+    def _reason(self, slip_ratio: Array, age_s: float) -> str:
+        """Return why no slip is known, in a sentence; empty where one is."""
+        if np.isfinite(slip_ratio).any():
+            return ""
+        if self._skids:
+            return f"the filter {self.name} takes no speed over ground"
+        if age_s == math.inf:
+            return "no speed over ground has come yet"
+        return (
+            "the wheels stand"
+            if age_s <= STALE_AFTER_S
+            else f"the last speed over ground is {age_s:.1f} s old"
         )
 
 

@@ -228,6 +228,7 @@
     }
     const none = seen.slip_ratio.every((value) => value === null) && !series.slip.some((one) => one.slip.some((value) => value !== null));
     if (none !== byId("slip").hidden) { showSlip(!none); makePlots(); }
+    text("slip-none", seen.slip_unknown ? "Slip is not known: " + seen.slip_unknown + "." : "Slip is not known yet.");
   }
   function axes() {
     const common = { stroke: variable("--soft"), grid: { stroke: variable("--line"), width: 1 }, ticks: { stroke: variable("--line") } };
@@ -256,10 +257,9 @@
     const title = state.wheels.map((name, i) => "wheel " + name + " " + ["solid", "dashed", "dotted", "dash-dot"][i % 4]).join(", ");
     plots.current = plotIn(figureIn(byId("current"), title || "no wheels described"), state.wheels.map((_, i) => ({ stroke: COLOURS[i % COLOURS.length], width: 2, dash: [[], [8, 4], [2, 3], [8, 3, 2, 3]][i % 4], points: { show: false } })), [], currentRange);
   }
-  function showSlip(there, reason) {
+  function showSlip(there) {
     byId("slip").hidden = byId("slip-note").hidden = !there;
-    byId("slip-none").hidden = there && !reason;
-    byId("slip-none").textContent = reason ? "Slip is not known: " + reason + "." : "Slip is not known yet.";
+    byId("slip-none").hidden = there;
   }
   function draw() {
     requestAnimationFrame(draw);

@@ -4,12 +4,10 @@ The body moves with V = (v_x, v_y, w) at its origin, heading psi.  Row i of the 
 a wheel in :math:`D_i` (:func:`terrain.kinematics.wheels.rolling_matrix`), its circumferential speed :math:`u_i` and the
 root mean square U of all of them, is
 
-.. math:: D_i V = u_i (1 - m_i) - |u_i|\, c f - \chi\, t_i - d_i U .
+.. math:: D_i V = u_i (1 - m_i) - \chi\, t_i - d_i U .
 
 - **m**, the slip of this ground, of each side of a robot that skids and each wheel that rolls across, else of all
   wheels: a random walk while the robot moves, the same forward and backward, and through standstill.
-- **c**, what slip grows by with traction: f is the specific force ahead over gravity, what an accelerometer measures,
-  be it for a slope or an acceleration, low-passed; so slip uphill is no other ground than slip downhill.
 - **chi**, what is lost in turning.  Robots that skid: :math:`t = \mp (u_r - u_l) / 2` left and right, so that straight
   motion does not show it and the effective track is :math:`B / (1 - \chi)` (Mandow et al., Experimental kinematics for
   wheeled skid-steer mobile robots, IROS 2007).  Robots that steer: a row across the front wheel, which does not slide,
@@ -75,8 +73,6 @@ weight in traction, adds; and what turning on the spot does."""
 YIELDING_RATIO = 0.3
 """Length over the radius of a wheel that it rolls from rest until the contact pulls: tyre and soil yield first, a track
 and a gear have slack; d is then of the order of 1."""
-FORCE_SLIP, FORCE_SLIP_STD, FORCE_SLIP_WALK = 0.4, 0.4, 0.05
-"""Of c at first, and its walk within a second: a tenth on hard ground, 1 on loose sand."""
 SLOW_RATIO, SLOW_WALK = 0.2, 0.03
 """Of m at first, about 0, and its walk within a second of driving."""
 TURN_WALK, DIRECTION_RATIO = 0.02, 0.1
@@ -102,10 +98,9 @@ ALIGNED_RAD, CRAB_RAD, LOST_RAD = 0.05, 0.05, 0.6
 """Deviation at which a heading by the motion is used; that of the motion from the heading; and one that is lost."""
 LEAST_TRAVEL_M, LEAST_RATIO = 0.5, 0.3
 """Travel by the wheels that shows a heading, and how much of it the receiver has to see."""
-DELAY_BOUNDS_S, SLIP_BOUNDS, FORCE_BOUNDS = (-0.2, 0.8), (-3.0, 3.0), (-5.0, 5.0)
-LOSS_BOUNDS, LARGEST_BIAS_MPS2 = (-3.0, 3.0), 3.0
-"""Bounds of delay, m and d, c, and chi, which move the mean; and a bias beyond which an accelerometer is left out: its
-units or axes are others."""
+DELAY_BOUNDS_S, SLIP_BOUNDS, LARGEST_BIAS_MPS2 = (-0.2, 0.8), (-3.0, 3.0), 3.0
+"""Bounds of delay and of m, chi and d, far from what they are, which move the mean; and a bias beyond which an
+accelerometer is left out: its units or axes are others."""
 OLDEST_S = 1.0
 """Age of a fix beyond which there is none."""
 LOST_S, LOST_RATIO = 2.0, 0.9
@@ -131,12 +126,12 @@ MOST_ROWS = 6  # of a swerve robot: along and across each wheel
 _N_ROWS, _N_SLOW, _TURNS, _FREE_ACROSS, _ANTENNA, _POSED, _SEEN, _GROUP = 0, 1, 2, 3, 4, 6, 8, 10
 _D = _GROUP + MOST_ROWS
 _U, _T, _SIZE = _D + 3 * MOST_ROWS, _D + 4 * MOST_ROWS, _D + 5 * MOST_ROWS
-_FORCE, _ACCEL, _MEAN_ACCEL, _AGES = _SIZE + 1, _SIZE + 2, _SIZE + 3, _SIZE + 4
+_ACCEL, _MEAN_ACCEL, _AGES = _SIZE + 1, _SIZE + 2, _SIZE + 3
 _SPEEDS, _TURNING = slice(_U - _D, _T - _D), slice(_T - _D, _SIZE - _D)  # among the inputs
 _INPUTS = (
     *(f"d_{i}" for i in range(3 * MOST_ROWS)),
     *(f"{name}_{i}" for name in "ut" for i in range(MOST_ROWS)),
-    *("size", "force", "accel", "mean_accel", "gnss_age", "pose_age", "camera_age"),
+    *("size", "accel", "mean_accel", "gnss_age", "pose_age", "camera_age"),
 )
 
 _REFERENCES = (
@@ -163,7 +158,7 @@ def _move(x: Array, dt: float, params: Array, x_next: Array) -> None:
         x_next[_VY] *= math.exp(-dt / ACROSS_S)
     else:
         x_next[_VY] -= dt * x[_W] * x[_VX]
-    fast = _SLOW + int(params[_N_SLOW] + params[_TURNS]) + 1
+    fast = _SLOW + int(params[_N_SLOW] + params[_TURNS])
     for i in range(int(params[_N_ROWS])):
         x_next[fast + i] *= math.exp(-dt / FAST_S)
 
@@ -180,10 +175,9 @@ def _wheels(x: Array, params: Array, z: Array) -> None:
         d = _D + 3 * i
         ground = params[d] * x[_VX] + params[d + 1] * x[_VY] + params[d + 2] * x[_W]
         z[i] = ground - params[_U + i] * (1.0 - x[_SLOW + int(params[_GROUP + i])])
-        z[i] += abs(params[_U + i]) * params[_FORCE] * x[_SLOW + n_slow]
         if turns > 0:
-            z[i] += params[_T + i] * x[_SLOW + n_slow + 1]
-        z[i] += params[_SIZE] * x[_SLOW + n_slow + turns + 1 + i]
+            z[i] += params[_T + i] * x[_SLOW + n_slow]
+        z[i] += params[_SIZE] * x[_SLOW + n_slow + turns + i]
 
 
 @njit
@@ -292,7 +286,7 @@ class SlipFilter(FilterObserver):
         n_slow, n_rows, turns = 1 + max(groups), len(groups), robot.skids or isinstance(robot, BicycleRobot)
         names = [robot.wheels[i] for i in logged.tolist()]
         slow = [f"ground_slip_{name}_ratio" for name in names] if n_slow > 1 else ["ground_slip_ratio"]
-        self.states = (*_MOTION, *slow, "force_slip_ratio", *["turn_loss_ratio"] * turns)
+        self.states = (*_MOTION, *slow, *["turn_loss_ratio"] * turns)
         self.slips = tuple(f"slip_{name}_ratio" for name in names)
         self._speeds = tuple(f"speed_{name}_mps" for name in names)
         steer = tuple(f"steer_{name}_rad" for name in robot.steered_wheels)
@@ -331,12 +325,11 @@ class SlipFilter(FilterObserver):
             initial_variance=np.square(
                 [1e-3, 1e-3, 1e-3, 1.0, 0.1, 0.5, BIAS_STD_RADPS, UNTILTED_STD, DELAY_STD_S]
                 + [SLOW_RATIO] * n_slow
-                + [FORCE_SLIP_STD]
                 + [loss_std] * turns
                 + [FAST_RATIO] * n_rows
             ),
             initial_mean=np.array(
-                [0.0] * _DELAY + [DELAY_S] + [0.0] * n_slow + [FORCE_SLIP] + [loss] * turns + [0.0] * n_rows
+                [0.0] * _DELAY + [DELAY_S] + [0.0] * n_slow + [loss] * turns + [0.0] * n_rows
             ),
             inputs=_INPUTS,
             references=("pose", "gnss_position", "gnss_speed", "camera"),
@@ -350,14 +343,7 @@ class SlipFilter(FilterObserver):
         self._smooth_mps, self._accel_mps2, self._shaken_square = np.full(len(logged), np.nan), math.nan, 0.0
         self._pulls, self._accel_is_wrong, self._rolled_m = np.zeros(len(logged)), False, 0.0
         self._has_delay = False
-        self._force = 0.0  # specific force ahead, low-passed
-        bounds = [
-            DELAY_BOUNDS_S,
-            *[SLIP_BOUNDS] * n_slow,
-            FORCE_BOUNDS,
-            *[LOSS_BOUNDS] * turns,
-            *[SLIP_BOUNDS] * n_rows,
-        ]
+        bounds = [DELAY_BOUNDS_S, *[SLIP_BOUNDS] * (n_slow + turns + n_rows)]
         self._bounds = np.array(bounds)
         self._poses = np.zeros((0, 4))  # age in ticks' time, position and heading
         self._pose_square, self._n_poses = np.square([POSE_STD_M, POSE_STD_RAD]), N_POSES
@@ -427,8 +413,6 @@ class SlipFilter(FilterObserver):
         elif isinstance(self._robot, BicycleRobot):
             turning[n] = rolling[0, 0] * known[0] * math.sin(float(directions[0]))
         accel = given["accel_x_mps2"]
-        self._force += 0.0 if math.isnan(accel) else -math.expm1(-dt_s / VIBRATION_S) * (accel - self._force)
-        force = 0.0 if self._robot.sideways or self._accel_is_wrong else self._force / GRAVITY_MPS2
         if math.isfinite(given["pitch_rad"]):  # the specific force at rest is -g sin(pitch)
             accel += GRAVITY_MPS2 * math.sin(given["pitch_rad"])
         accel = accel if abs(accel) <= MOST_MPS2 and not self._accel_is_wrong else math.nan
@@ -441,7 +425,7 @@ class SlipFilter(FilterObserver):
         size = math.sqrt(float(np.mean(known**2)))
         ages = [given[name] if 0.0 <= given[name] <= OLDEST_S else 0.0 for name in _AGE_ROWS]
         inputs[: 3 * MOST_ROWS], inputs[_SPEEDS][:n], inputs[_TURNING] = rolling.ravel(), known, turning
-        inputs[_SIZE - _D :] = size, force, accel, self._accel_mps2, *ages
+        inputs[_SIZE - _D :] = size, accel, self._accel_mps2, *ages
         self.accel_mps2 = accel - float(self.filter.mean[_ACCEL_BIAS])
         return inputs
 
@@ -485,8 +469,7 @@ class SlipFilter(FilterObserver):
             turned = float(np.linalg.norm(pulls - self._pulls))
             walk[_SLOW : _SLOW + n_slow] = SLOW_WALK**2 + DIRECTION_RATIO**2 * turned / dt_s
             self._pulls = pulls
-            walk[_SLOW + n_slow] = FORCE_SLIP_WALK**2
-            walk[_SLOW + n_slow + 1 : len(self.states)] = (TURN_WALK * tight) ** 2
+            walk[_SLOW + n_slow : len(self.states)] = (TURN_WALK * tight) ** 2
         self._rolled_m = self._rolled_m + size * dt_s if size > STANDING_MPS else 0.0
         yields = math.exp(-self._rolled_m / (YIELDING_RATIO * self._robot.wheel_radius_m))
         fast = FAST_RATIO + FAST_PER_MPS2 * float(np.abs(rates_mps2).max()) + FAST_TURNING * tight + yields
@@ -616,21 +599,27 @@ class SlipFilter(FilterObserver):
             status = ObserverStatus.STANDING
         elif fix is ObserverStatus.OK and age_s > PREDICTED_S:
             status = ObserverStatus.PREDICTED
-        self.reference_age_s, self.reason = age_s, self._reason(age_s, deviation)
+        self.reference_age_s, self.reason = age_s, self._reason(age_s, slip, fastest)
         std = np.sqrt(np.maximum(self.filter.cov.diagonal()[:d], 0.0))
         return ObserverOutput(mean[:d].copy(), std, slip, deviation, int(status))
 
-    def _reason(self, age_s: float, deviation: Array) -> str:
-        """Return why slip is unknown, in a sentence; empty where it is known or the robot stands."""
+    def _reason(self, age_s: float, slip: Array, fastest_mps: Array) -> str:
+        """Return why no slip is known, in a sentence; empty where one is."""
+        if np.isfinite(slip).any():
+            return ""
         if age_s == math.inf and (self._weight > 0.0 or not np.isnan(self._first[0])):
             return (
                 f"the heading is not known yet: it follows from a motion of {LEAST_TRAVEL_M:g} m with fixes"
             )
         if age_s == math.inf:
-            return "nothing has measured the speed over ground: no fix, pose or camera"
-        if age_s > PREDICTED_S and np.isnan(deviation).all():
-            return f"the speed over ground was last measured {age_s:.0f} s ago"
-        return ""
+            return "no position, pose or speed over ground has come yet"
+        if np.isnan(fastest_mps).all():
+            return "no speed of a wheel comes"
+        if np.nanmax(fastest_mps) < MIN_SPEED_MPS:
+            return "the wheels stand"
+        return (
+            f"it is uncertain by more than {UNKNOWN_RATIO:g}, {age_s:.1f} s after the last speed over ground"
+        )
 
 
 def _fading(variance: float, time_s: float, dt_s: float) -> float:
