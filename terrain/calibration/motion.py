@@ -79,7 +79,7 @@ APART_S = 10.0  #: Runs are laid out on one axis of time, so far apart.
 FIRST_ERROR = 0.02  #: Size of residuals that a fit begins with, in m and rad, and the least.
 LEAST_ERROR = 1e-4
 NEAR_BOUND = 0.02  #: Part of the range of a parameter within which it stands at its end.
-TRIED_S = 0.05  #: Steps of delays that are tried before.
+TRIED_S = 0.1  #: Steps of delays that are tried before.
 DIFFERENCE = 0.01  #: Step of a derivative, in units of the search.
 SLIP_STEPS = 2  #: Of the slip by traction and the acceleration that it leaves.
 HEADING_STEPS = 3  #: Of the heading of a receiver and the weights of its fixes.
@@ -407,13 +407,18 @@ def lay_out(runs: Sequence[RunLog], robot: Robot, source: str, leg_s: float | No
     period_s = [
         np.median(np.diff(run.streams[source].time_s)) for run in runs if len(run.streams.get(source, ())) > 1
     ]
-    chosen_s = max(LEG_S[source] if leg_s is None else leg_s, 2.0 * float(max(period_s, default=0.0)))
+    chosen_s = max(LEG_S[source] if leg_s is None else leg_s, 2.0 * float(np.median(period_s or [0.0])))
     parts, used, why, from_s = list[dict[str, Array]](), list[RunLog](), "", 0.0
     n_ends, n_blocks = 0, 0
     for run in runs:
         part = _laid_out(run, robot, source, chosen_s)
         if isinstance(part, str):
             why = why or f"run {run.run_id}: {part}"
+            continue
+        if not len(part["pairs"]):  # it takes time and shows nothing
+            why = (
+                why or f"run {run.run_id}: it has no leg of {chosen_s:g} s with {WORDS[source]} at both ends"
+            )
             continue
         stamps = [part[name] for name in ("wheels_s", "stamps_s", "gyro_s", "steer_s") if len(part[name])]
         shift_s = from_s - min(each[0] for each in stamps)
@@ -691,7 +696,8 @@ def fit_motion(
 
         # a search that begins at a bound hardly leaves it
         inside = np.maximum(start, [p.low + 0.5 * p.unit for p in parameters])
-        fit = identify(by_size, parameters, cluster, True, [inside], derivative, ftol=1e-6, xtol=1e-6)
+        enough = 1e-3 if left else 1e-6  # of a pass that finds sizes
+        fit = identify(by_size, parameters, cluster, True, [inside], derivative, ftol=enough, xtol=enough)
         error = np.maximum(1.48 * np.median(np.abs(residual(fit.value)), axis=0), LEAST_ERROR)
         start = fit.value
         if left and "force_slip_ratio" in chosen and fit.at_bound[k := chosen.index("force_slip_ratio")]:

@@ -342,7 +342,7 @@ def test_numbers_of_a_skid_steer_robot_come_back_by_a_receiver(seed):
     assert "turns about" in found["lever_x_m"].note
 
 
-def car_run(seed, n=4000, gain=1.06, offset=0.02, radius=1.03):
+def car_run(seed, n=2500, gain=1.06, offset=0.02, radius=1.03):
     """A car-like robot whose rear axle is measured; its tyres do not yield."""
     robot, rng = load_robot("adap2e"), np.random.default_rng(seed)
     speed, angle, time_s = 1.5 + waves(rng, n, 1.0), waves(rng, n, 0.25), DT * np.arange(n)
@@ -364,7 +364,7 @@ def omni_run(seed, n=3000, radius=0.95, distance=0.13):
     return by_receiver(run, twist, (0.05, -0.02), seed)
 
 
-def tracked_run(seed, n=4000, radius=0.97, track_m=0.9, period_s=0.1):
+def tracked_run(seed, n=2500, radius=0.97, track_m=0.9, period_s=0.1):
     robot, rng = load_robot("patako"), np.random.default_rng(seed)
     twist, time_s = np.column_stack([waves(rng, n, 0.4), np.zeros(n), waves(rng, n, 0.5)]), DT * np.arange(n)
     sides = np.column_stack([twist[:, 0] / radius + sign * twist[:, 2] * track_m / 2 for sign in (-1, 1)])
