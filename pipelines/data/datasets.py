@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import chain
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipelines.data.settings import AlignedRunsSettings, RunsSettings, chosen_runs
 from terrain.errors import ConfigError, DoubtfulRunWarning, LogError, TerrainError
-from terrain.logs.motion_checks import Described
+from terrain.logs.motion_checks import Described, is_short
 from terrain.logs.plausibility import (
     Check,
     Doubt,
@@ -23,6 +24,7 @@ from terrain.logs.plausibility import (
     doubt_sentences,
     doubts_of,
     judge,
+    judge_together,
     refuse_implausible_runs,
 )
 
@@ -62,6 +64,8 @@ FOUND_BY: dict[str, tuple[str, tuple[str, ...]]] = {
     "tricycle": ("terrain.logs.tricycle:find_runs", ("*.txt", "*.txt.gz")),
 }
 """What finds the runs of each layout, and patterns of its files: without one of these it is not even imported."""
+
+MOST_TOGETHER = 100  #: Short runs that are judged together: so many show what all do
 
 _log = logging.getLogger(__name__)
 
@@ -205,7 +209,7 @@ def read(settings: RunsSettings, *, refuse: bool = True) -> ReadRuns:
     if isinstance(settings, AlignedRunsSettings):
         runs = chosen_runs(runs, settings)
     robot = named_robot(settings)
-    verdicts = {run.run_id: verdict(run, robot) for run in runs}
+    verdicts = verdicts_of(runs, robot)
     doubts = doubts_of(verdicts)
     if repair:
         runs = [counted(run, verdicts[run.run_id]) for run in runs]
@@ -239,6 +243,28 @@ def run_loaders(settings: RunsSettings) -> list[RunLoader]:
     return [RunLoader(read, settings.repair, align, robot) for read in readers]
 
 
+def verdicts_of(runs: Sequence[RunLog], robot: Robot | None = None) -> dict[str, tuple[Check, ...]]:
+    """Return the checks of each run by its id, with those of short runs of one robot taken together.
+
+    Parameters
+    ----------
+    runs, robot : as :func:`verdict` takes one
+    """
+    verdicts: dict[str, tuple[Check, ...]] = {}
+    alike: defaultdict[Any, list[tuple[RunLog, Described]]] = defaultdict(list)
+    for run in runs:
+        known, described = _described(run, robot)
+        verdicts[run.run_id] = judge(known, described)
+        if is_short(known):
+            sensors = frozenset((name, stream.channels) for name, stream in known.streams.items())
+            alike[run.robot, sensors].append((known, described))
+    for group in alike.values():
+        odd = judge_together(group[:: 1 + len(group) // MOST_TOGETHER])
+        for run, _ in group if odd else ():
+            verdicts[run.run_id] += odd
+    return verdicts
+
+
 def verdict(run: RunLog, robot: Robot | None = None) -> tuple[Check, ...]:
     """Return the checks of a run, with what is known of its robot.
 
@@ -247,6 +273,11 @@ def verdict(run: RunLog, robot: Robot | None = None) -> tuple[Check, ...]:
     run : as a reader returns it
     robot : that the user named; where the run names another, that of the package
     """
+    return judge(*_described(run, robot))
+
+
+def _described(run: RunLog, robot: Robot | None) -> tuple[RunLog, Described]:
+    """Return a run with the speeds of its wheels where rates of motors are logged, and what is known of its robot."""
     from terrain.kinematics.logged_wheels import with_wheel_speeds
     from terrain.robots import robot_named
 
@@ -254,11 +285,11 @@ def verdict(run: RunLog, robot: Robot | None = None) -> tuple[Check, ...]:
         known = robot_named(run.robot, robot)
         run = with_wheel_speeds(run, known) if known.describes("motors") else run
     except ConfigError:
-        return judge(run)
+        return run, Described()
     fastest_mps = getattr(known, "speed_max_mps", _wheel_rate_max_radps(known) * known.wheel_radius_m)
     motors = known.motors if known.describes("motors") else None
     twist, contradiction = _motion_of_wheels(run, known)
-    described = Described(
+    return run, Described(
         track_m=known.track_m,
         speed_max_mps=fastest_mps,
         twist=twist,
@@ -271,7 +302,6 @@ def verdict(run: RunLog, robot: Robot | None = None) -> tuple[Check, ...]:
         steering_rate_max_radps=known.steering_rate_max_radps,
         current_max_a=math.inf if motors is None else motors.torque_max_nm / motors.nm_per_a,
     )
-    return judge(run, described)
 
 
 def _motion_of_wheels(run: RunLog, robot: Robot) -> tuple[Stream | None, tuple[float, float]]:

@@ -165,13 +165,13 @@ def estimate_runs(
     >>> tracks.result.filter, sorted(set(tracks.runs[0].streams) - set(run.streams))
     ('vio15', ['estimator', 'slip', 'state'])
     """
-    from pipelines.data.datasets import verdict, warn_of
+    from pipelines.data.datasets import verdicts_of, warn_of
     from pipelines.report.results import silent
     from terrain.logs.plausibility import doubts_of
 
     runs = list(runs)
     kept: list[RunLog] = []
-    warn_of(doubts_of({run.run_id: verdict(run, robot) for run in runs}))
+    warn_of(doubts_of(verdicts_of(runs, robot)))
     asked = EstimateOptions(filter=filter, **options)
     result = _estimated(runs, robot, asked, progress or silent, lambda run, figures: kept.append(run))
     return Estimates(tuple(kept), result)

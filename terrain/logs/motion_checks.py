@@ -31,7 +31,7 @@ STEP_S = 0.2
 MEAN_S = 1.0  #: Changes of positions and angles are over this: noise of a receiver of 2 cm is then 3 cm/s
 MIN_POINTS = 15
 SHIFTS_S = np.linspace(-1.4, 1.4, 15)
-MIN_SPEED_MPS = 0.1  #: Root mean square below which noise is as large as the motion
+MIN_SPEED_MPS = 0.05  #: Root mean square below which noise is as large as the motion
 MIN_TURN_RADPS = 0.1
 #: Cosine of the angle between two signals, from which their ratio and its sign mean something; of speeds, which are all
 #: positive, the correlation.
@@ -57,7 +57,7 @@ MIN_TILT_RAD = 0.02  #: Less is that of a floor, and of offsets.
 MIN_CERTAIN_POINTS = (
     50  #: A run of 10 s; of a shorter one, noise and a shift of clocks may look like a mistake
 )
-WHEELS = "the wheels"
+WHEELS, ACCELEROMETER = "the wheels", "the accelerometer"
 #: Factors of usual mistakes.
 SPEED_FACTORS: Mapping[str, float] = {"km/h": 3.6, "cm": 100.0, "mm": 1000.0}
 GNSS_FACTORS: Mapping[str, float] = {"knots": 1.9438}
@@ -102,6 +102,7 @@ class Seen(NamedTuple):
     in_body: bool = False
     yaw_rate_radps: Array | None = None  #: (n,)
     power: Array | None = None  #: squared speed of a course, by which its turn is weighted
+    acceleration_mps2: Array | None = None  #: (n,) ahead, with what gravity adds
 
 
 def motion_findings(run: RunLog, robot: Described) -> list[Finding]:
@@ -124,16 +125,58 @@ def motion_findings(run: RunLog, robot: Described) -> list[Finding]:
         return []
     sources = _sources(run, robot, grid_s)
     return [
-        *_speeds(sources, robot),
-        *_yaw_rates(sources, robot),
-        *_directions(sources, robot),
+        *_compared(sources, robot),
         *_still_positions(run, sources),
-        *_acceleration(run, robot, grid_s),
         *_attitude(run, grid_s),
         *_steering(run, robot, grid_s),
         *_receiver(run),
         *_currents(run, robot),
     ]
+
+
+def joint_findings(runs: Sequence[tuple[RunLog, Described]]) -> list[Finding]:
+    """Return what short runs of one robot with the same sensors show together, as if they were one; odd ones only.
+
+    A command of 6 s shows neither a ratio nor a sign for certain; a hundred of them do.
+    """
+    parts = [_sources(run, robot, grid_s) for run, robot in runs if len(grid_s := _grid(run)) >= MIN_POINTS]
+    if len(parts) < 2:
+        return []
+    names = [seen.name for seen in parts[0]]
+    parts = [sources for sources in parts if [seen.name for seen in sources] == names]
+    apart = max(map(abs, SHIFTS_S.tolist())) / STEP_S  # no shift compares one run with the next
+
+    def joined(k: int, field: str) -> Array | None:
+        values = [getattr(sources[k], field) for sources in parts]
+        if any(each is None for each in values):
+            return None
+        gap = np.full((math.ceil(apart) + 1, *values[0].shape[1:]), np.nan)
+        return np.concatenate([rows for each in values for rows in (each, gap)])
+
+    sources = [
+        Seen(
+            seen.name,
+            joined(k, "velocity_mps"),
+            seen.in_body,
+            joined(k, "yaw_rate_radps"),
+            joined(k, "power"),
+            joined(k, "acceleration_mps2"),
+        )
+        for k, seen in enumerate(parts[0])
+    ]
+    over = f"over {len(parts)} runs, "
+    found = _compared(sources, runs[0][1])
+    return [each._replace(sentence=over + each.sentence) for each in found if each.level > 0]
+
+
+def is_short(run: RunLog) -> bool:
+    """Return whether a run is too short to be judged by itself in what compares two sensors."""
+    return len(_grid(run)) < 2 * MIN_CERTAIN_POINTS
+
+
+def _compared(sources: Sequence[Seen], robot: Described) -> list[Finding]:
+    pairs = _speeds(sources, robot), _yaw_rates(sources, robot), _directions(sources, robot)
+    return [*pairs[0], *pairs[1], *pairs[2], *_acceleration(sources)]
 
 
 # -- What each sensor shows, a mean of a second ---------------------------------------------------------------
@@ -219,7 +262,8 @@ def _sources(run: RunLog, robot: Described, grid_s: Array) -> list[Seen]:
     if (twist := robot.twist) is not None:
         sides = "wheels" in run.streams and "speed_left_mps" in run.streams["wheels"].channels
         turn = None if sides else _change(twist.time_s, twist.channel(TWIST[2]), grid_s, of_rate=True)
-        sources.append(Seen(WHEELS, _plane(twist, SPEEDS, grid_s, of_rate=True), True, turn))
+        ahead = _change(twist.time_s, twist.channel(TWIST[0]), grid_s, of_rate=False)
+        sources.append(Seen(WHEELS, _plane(twist, SPEEDS, grid_s, of_rate=True), True, turn, None, ahead))
     for name in ("lidar", "odometry", "pose", "gnss", "imu", "compass"):
         stream = run.streams.get(name)
         if stream is None:
@@ -231,6 +275,9 @@ def _sources(run: RunLog, robot: Described, grid_s: Array) -> list[Seen]:
         if name == "imu" and turn is not None:
             sources.insert(0, Seen("the gyro", yaw_rate_radps=turn))
             turn = None
+        if name == "imu" and "accel_x_mps2" in has:
+            ahead = _change(t, stream.channel("accel_x_mps2"), grid_s, of_rate=True)
+            sources.append(Seen(ACCELEROMETER, acceleration_mps2=ahead))
         if "yaw_rad" in has:
             turn = _angle_rate(t, stream.channel("yaw_rad"), grid_s)
         body = _plane(stream, SPEEDS, grid_s, of_rate=True)
@@ -336,7 +383,14 @@ def _speeds(sources: Sequence[Seen], robot: Described) -> list[Finding]:
     for name, values in speed.items():
         if name == middle or name not in ranked:
             continue
-        slow = np.minimum(values, speed[middle])
+        # beside wheels, whose unit may be wrong, what measures the ground says how fast the robot goes
+        slow = (
+            speed[middle]
+            if name == WHEELS
+            else values
+            if middle == WHEELS
+            else np.minimum(values, speed[middle])
+        )
         goes = _turn_speed(sources, robot) < 0.5 * slow
         by = _compare(
             *(np.where(goes, each, np.nan)[:, None] for each in (values, speed[middle])), about_mean=True
@@ -356,8 +410,11 @@ def _speeds(sources: Sequence[Seen], robot: Described) -> list[Finding]:
         of = f"speed: that of {name} is {by.ratio:.3g} times that of {middle}"
         known = factors | dict(GNSS_FACTORS if "gnss" in (name + middle) else {})
         odd = f"{of}, {low:.2g} to {high:.2g} is expected: {mistake(by.ratio, known)}"
-        beyond = by.cosine >= MIN_LIKENESS and not least <= by.ratio <= most
+        beyond = not least <= by.ratio <= most
         judged = _level(by.n, not low <= by.ratio <= high, beyond)
+        if by.cosine < MIN_LIKENESS:  # of two steady speeds; noise of a receiver at rest is a speed, too
+            noisy = by.n < MIN_CERTAIN_POINTS or ("gnss" in (name + middle) and by.cosine < 0.5)
+            judged = 0 if noisy else min(judged, 1)
         place = WHEELS if WHEELS in (name, middle) and len(ranked) == 2 else name
         found.append(Finding("speed", judged, place, by.ratio, odd if judged else of))
     return found
@@ -450,6 +507,9 @@ def _directions(sources: Sequence[Seen], robot: Described) -> list[Finding]:
         if level:
             odd = f"{of}, which cannot drive sideways: axes exchanged, or a yaw off by 90 degrees?"
             found.append(Finding("direction", level, seen.name, ahead, odd))
+        elif robot.sideways and wheels is not None and (turned := _turned_axes(v, wheels, by)):
+            odd = f"direction: {seen.name} moves as the wheels do {turned}: other axes, or another zero of its yaw?"
+            found.append(Finding("direction", _level(by.n, True, True), seen.name, by.cosine, odd))
         elif by.is_known and by.cosine < 0.0:
             odd = f"direction: {seen.name} moves against the wheels: a turned sign, or a yaw off by 180 degrees?"
             found.append(Finding("direction", _level(by.n, True, True), seen.name, by.cosine, odd))
@@ -474,6 +534,29 @@ def _still_positions(run: RunLog, sources: Sequence[Seen]) -> list[Finding]:
     return [Finding("position", 2, "gnss", spread_m, odd)]
 
 
+def _turned_axes(velocity_mps: Array, wheels_mps: Array, by: Likeness) -> str:
+    """Return how velocities (n, 2) have to be turned or mirrored to be those of the wheels; empty where they need not.
+
+    The rotation, or mirror, that brings one nearest to the other is by the singular values of their products
+    (Schoenemann, Psychometrika 1966).
+    """
+    both = np.isfinite(velocity_mps).all(axis=1) & np.isfinite(wheels_mps).all(axis=1)
+    if by.cosine >= 0.5 or both.sum() < MIN_POINTS:
+        return ""
+    u, singular, vt = np.linalg.svd(velocity_mps[both].T @ wheels_mps[both])
+    turn = u @ vt
+    straight = (
+        singular[1] < 0.1 * singular[0]
+    )  # of one direction, which a rotation explains as well as a mirror
+    if straight and np.linalg.det(turn) < 0.0:
+        turn = u @ np.diag([1.0, -1.0]) @ vt
+    if abs(_compare(velocity_mps @ turn, wheels_mps).cosine) < MIN_LIKENESS:
+        return ""
+    if np.linalg.det(turn) < 0.0:
+        return "in a mirror"
+    return f"turned by {np.degrees(math.atan2(turn[0, 1], turn[0, 0])):.0f} degrees"
+
+
 # -- Sensors by themselves ------------------------------------------------------------------------------------
 
 
@@ -482,14 +565,12 @@ def _quantile(values: Array, part: float = 0.99) -> float:
     return float(np.quantile(known, part)) if known.size else math.nan
 
 
-def _acceleration(run: RunLog, robot: Described, grid_s: Array) -> list[Finding]:
+def _acceleration(sources: Sequence[Seen]) -> list[Finding]:
     """Compare the specific force ahead with the acceleration of the wheels; slopes add to it: at most doubtful."""
-    imu = run.streams.get("imu")
-    if robot.twist is None or imu is None or "accel_x_mps2" not in imu.channels:
+    seen = {each.name: each.acceleration_mps2 for each in sources if each.acceleration_mps2 is not None}
+    if len(seen) < 2:
         return []
-    speed_mps = robot.twist.channel(TWIST[0])
-    wheels = _change(robot.twist.time_s, speed_mps, grid_s, of_rate=False)
-    by = _compare_changes(_change(imu.time_s, imu.channel("accel_x_mps2"), grid_s, of_rate=True), wheels)
+    by = _compare_changes(seen[ACCELEROMETER], seen[WHEELS])
     if not by.is_known or by.least < MIN_ACCELERATION_MPS2:
         return []
     of = f"acceleration: accel_x is {math.copysign(by.ratio, by.cosine):.3g} times the acceleration of the wheels"

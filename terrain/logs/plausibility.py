@@ -31,7 +31,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError, LogError
 from terrain.logs.clock import MIN_SAMPLES as MIN_YAW_RATES
 from terrain.logs.clock import yaw_rate_pair
-from terrain.logs.motion_checks import Described, motion_findings
+from terrain.logs.motion_checks import Described, Finding, joint_findings, motion_findings
 from terrain.logs.samples import BEYOND, MAX_MAGNITUDE
 from terrain.logs.schema import NO_FEATURES, signal_set_of, unit_of
 from terrain.records import Array, RunLog, Stream
@@ -193,9 +193,17 @@ def judge(run: RunLog, robot: Described = UNKNOWN_ROBOT) -> tuple[Check, ...]:
     checks = [_gravity(known), _turns(known, robot), _speeds(known, robot)]
     for name, stream in run.streams.items():
         checks += [_sampling(name, stream), *check_names(name, stream)]
-    levels = (OK, DOUBTFUL, IMPLAUSIBLE)
-    motion = [Check(each.check, levels[each.level], *each[2:]) for each in motion_findings(known, robot)]
+    motion = map(_check_of, motion_findings(known, robot))
     return (*checks, *motion, *_values(run), *_constants(known), _overlap(run))
+
+
+def judge_together(runs: Sequence[tuple[RunLog, Described]]) -> tuple[Check, ...]:
+    """Return what is odd about short runs of one robot with the same sensors, taken together."""
+    return tuple(map(_check_of, joint_findings(runs)))
+
+
+def _check_of(found: Finding) -> Check:
+    return Check(found.check, (OK, DOUBTFUL, IMPLAUSIBLE)[found.level], *found[2:])
 
 
 # -- Gravity: what an accelerometer measures on Earth ---------------------------------------------------------

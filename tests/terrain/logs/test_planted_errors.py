@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipelines.data.datasets import verdict
+from pipelines.data.datasets import verdict, verdicts_of
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
@@ -146,6 +146,7 @@ PLANTED = [
     ("robotino", scaled("wheels", 1 / 16.0, "motor"), BAD, "before or after the reduction"),
     ("robotino", scaled("pose", 1e3, "position"), BAD, "mm?"),
     ("robotino", scaled("pose", -1.0, "yaw"), BAD, "a turned sign"),
+    ("robotino", shifted("pose", "yaw_rad", np.pi / 2), BAD, "turned by"),
     ("adap2e", scaled("steering", 1 / DEGREE, "angle"), BAD, "in degrees?"),
     ("adap2e", scaled("steering", -1.0, "angle"), BAD, "a turned sign of the steering"),
     ("adap2e", scaled("imu", 1 / DEGREE, "gyro"), BAD, "degrees?"),
@@ -172,6 +173,24 @@ def test_a_planted_error_is_refused_or_stated_in_a_sentence_that_names_it(robot,
     run = plant(sound(robot))
     stated = [check for check in judged(run) if check.level in (BAD, ODD)]
     assert any(sentence in check.sentence for check in stated if check.level == level), stated
+
+
+@pytest.mark.parametrize("plant", [scaled("odometry", 3.6, "speed"), scaled("odometry", -1.0, "speed")])
+def test_runs_of_seconds_show_together_what_none_of_them_shows(plant):
+    """Pieces of 6 s of a run; sound ones have no doubt, of one alone nothing is certain."""
+    whole, pieces = sound("husky"), []
+    for k in range(6):
+        streams = {}
+        for name, stream in whole.streams.items():
+            rows = (stream.time_s >= 6.0 * k) & (stream.time_s < 6.0 * (k + 1))
+            streams[name] = replace(stream, time_s=stream.time_s[rows], values=stream.values[rows])
+        pieces.append(replace(whole, run_id=f"piece_{k}", streams=streams))
+    motion = ("speed", "turns", "direction")
+    for runs, level in ((pieces, set()), ([plant(run) for run in pieces], {BAD})):
+        found = [check for checks in verdicts_of(runs).values() for check in checks if check.check in motion]
+        odd = [check for check in found if check.level in (BAD, ODD)]
+        assert {str(check.level) for check in odd if check.sentence.startswith("over 6 runs, ")} == level
+        assert all(check.level == ODD for check in odd if not check.sentence.startswith("over"))
 
 
 @pytest.mark.parametrize(
