@@ -83,8 +83,8 @@ def simulate(
 
     Parameters
     ----------
-    robot : the dynamic and the planar plant need all sections of a swerve robot; of other robots those that are missing
-        do not act
+    robot : sections that it lacks are assumed by the dynamic plant (:mod:`~terrain.simulation.assumed`); in the others
+        they do not act, but for swerve robots, of which the planar plant needs all
     drive : a scenario, or for the planar plant twists (n, 3), for tracks speeds (n, 2) of left and right, at 50 Hz; of
         a car its speed, stops and start
     ground : soils by the terrain names of the scenario (dynamic plant); a planar ground (planar plant); a soil that
@@ -94,7 +94,8 @@ def simulate(
     conditions : load, slope, tyres, roughness; level and nominal by default
     faults : faults of the sensors
     effects : parameters of :mod:`terrain.effects` that act on this robot and its sensors, beside those of its
-        description or in place of them; the commands and the log do not contain them
+        description or in place of them; the commands and the log do not contain them.  In the dynamic plant of swerve
+        robots alone
     options : of the plant: :func:`~terrain.simulation.plants.dynamic.run_dynamic` (gnss, poses, compass, controller,
         command_delay_s),
         :func:`~terrain.simulation.plants.planar.run_planar` (scatter, noise, outside, heading, fixes, terrain),
@@ -106,8 +107,8 @@ def simulate(
     RunLog
         streams wheels, imu, commands and truth, and steering where there is any; odometry (of a swerve robot the pose
         of a tracking camera, of others the speed of the camera's point in body axes), pose (of cameras around the
-        field), gnss and compass; and control, the status of a controller.  An omni robot has wheels, pose, commands
-        and truth.  None that was lost throughout.  Labels where a ground has a name.
+        field), gnss and compass; and control, the status of a controller.  An omni robot of the planar plant has
+        wheels, pose, commands and truth.  None that was lost throughout.  Labels where a ground has a name.
 
     Raises
     ------
@@ -182,7 +183,8 @@ def simulate_run(
     seed, number : of what is drawn
     duration_s : length; the scenario's own by default
     vary : draw soil, slope, load, tyres and roughness for this run by ``data/soils`` and ``data/spread``
-    conditions, faults, effects : as :func:`simulate` has them, conditions about which they vary
+    conditions, faults, effects : as :func:`simulate` has them, conditions about which they vary.  With effects, be it
+        none of them, other than swerve robots are simulated by the planar plant, which has none of the wheels' own
     gnss, poses : receiver on board, and what sees its pose from outside, beside what :func:`instruments` has
 
     Raises

@@ -832,6 +832,7 @@ def run_dynamic(
     check_step(plant, profile, built.name)
     n_steps = len(scenario.time_s) * substeps
     n_wheels, n_contacts = len(robot.wheels), int(plant["n_contacts"][0])
+    of_wheels, of_steer = slice(3, 3 + n_wheels), slice(3 + n_wheels, None)  # of a row of commands
     state = start_state(plant["dead_band_rad"][0] * rngs["start"].uniform(-1.0, 1.0, n_wheels))
     settle(plant, profile, state)
     road_noise = rngs["road"].standard_normal((n_steps, n_contacts))
@@ -874,13 +875,11 @@ def run_dynamic(
             part = slice(begin, begin + every)
             if robot.learned:
                 drift()
-            given = held[part, 3 : 3 + n_wheels].copy(), held[part, 3 + n_wheels :].copy(), road_noise[part]
+            given = held[part, of_wheels].copy(), held[part, of_steer].copy(), road_noise[part]
             advance(plant, profile, state, *given, rows[part])
     else:
-        decided, delay_steps = (
-            np.empty((len(scenario.time_s), 3 + 2 * n_wheels)),
-            max(round(command_delay_s / STEP_S), 1),
-        )
+        decided = np.empty((len(scenario.time_s), 3 + 2 * n_wheels))
+        delay_steps = max(round(command_delay_s / STEP_S), 1)
         wheel_radps, steer_rad = np.zeros((2, n_steps, n_wheels))  # in force at each step
         done = 0
         for k, time_s in enumerate(scenario.time_s.tolist()):
@@ -897,18 +896,14 @@ def run_dynamic(
                 sensor.update()
             arrived = ((name, sensor.arrived(time_s)) for name, sensor in sensors.items())
             readings = {name: reading for name, reading in arrived if reading is not None}
-            grounds = set(rows["wheels"]["patch_ratio"][step, :n_wheels].tolist())
-            terrain = (
-                scenario.patches[int(*grounds)].terrain if len(grounds) == 1 and min(grounds) >= 0 else ""
-            )
+            first, *others = rows["wheels"]["patch_ratio"][step, :n_wheels].tolist()
+            same = first >= 0 and all(other == first for other in others)
+            terrain = scenario.patches[int(first)].terrain if same else ""
             command = controller(Sample(time_s, scenario.twist[k], readings, terrain))
             decided[k], row_status = _checked(command, n_wheels, status[0] if status else None, time_s)
             status.append(row_status)
             in_force = slice(step + delay_steps, step + delay_steps + substeps)
-            wheel_radps[in_force], steer_rad[in_force] = (
-                decided[k, 3 : 3 + n_wheels],
-                decided[k, 3 + n_wheels :],
-            )
+            wheel_radps[in_force], steer_rad[in_force] = decided[k, of_wheels], decided[k, of_steer]
         else:
             part = slice(done, n_steps)
             advance(plant, profile, state, wheel_radps[part], steer_rad[part], road_noise[part], rows[part])
