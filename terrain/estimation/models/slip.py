@@ -76,8 +76,10 @@ and a gear have slack; d is then of the order of 1."""
 SLOW_RATIO, SLOW_WALK = 0.2, 0.03
 """Of m at first, about 0, and its walk within a second of driving."""
 TURN_WALK, DIRECTION_RATIO = 0.02, 0.1
-"""Walk of chi within a second of turning, and of m of a robot that drives in any direction where that changes by a
-radian: its wheels pull in another one."""
+"""Walk of chi within a second of turning, and deviation of m where the wheels begin to turn otherwise, in reverse or
+about a tighter turn, by a radian in the space of their speeds."""
+SLOPE_RATIO2, SLOPE_S = 0.1, 1.0
+"""Variance of m for a slope that changes by 1: a tenth of slope is a deviation of a tenth, as on loam; its low-pass."""
 ACROSS_RATIO, ACROSS_M = 0.03, 0.05
 """Sideways speed over the speed of the wheels, and over the yaw rate: of a robot that skids, and in turns."""
 WHEEL_STD_MPS, GYRO_STD_RADPS, YAW_ACCEL = 0.01, 0.005, 1.0
@@ -342,7 +344,7 @@ class SlipFilter(FilterObserver):
         self._rolling, self._steer = rolling_matrix(*place)[logged], steer
         self._smooth_mps, self._accel_mps2, self._shaken_square = np.full(len(logged), np.nan), math.nan, 0.0
         self._pulls, self._accel_is_wrong, self._rolled_m = np.zeros(len(logged)), False, 0.0
-        self._has_delay = False
+        self._has_delay, self._uphill, self._asked = False, 0.0, 0.0
         bounds = [DELAY_BOUNDS_S, *[SLIP_BOUNDS] * (n_slow + turns + n_rows)]
         self._bounds = np.array(bounds)
         self._poses = np.zeros((0, 4))  # age in ticks' time, position and heading
@@ -467,8 +469,12 @@ class SlipFilter(FilterObserver):
             smooth = np.nan_to_num(self._smooth_mps)
             pulls = smooth / max(float(np.linalg.norm(smooth)), STANDING_MPS)
             turned = float(np.linalg.norm(pulls - self._pulls))
-            walk[_SLOW : _SLOW + n_slow] = SLOW_WALK**2 + DIRECTION_RATIO**2 * turned / dt_s
-            self._pulls = pulls
+            if has_pitch:  # what gravity asks of the wheels, in the direction that they turn
+                self._uphill += -math.expm1(-dt_s / SLOPE_S) * (-math.sin(given["pitch_rad"]) - self._uphill)
+            asked = self._uphill * math.copysign(1.0, float(inputs[_SPEEDS].sum()))
+            changed = DIRECTION_RATIO**2 * turned + SLOPE_RATIO2 * abs(asked - self._asked)
+            walk[_SLOW : _SLOW + n_slow] = SLOW_WALK**2 + changed / dt_s
+            self._pulls, self._asked = pulls, asked
             walk[_SLOW + n_slow : len(self.states)] = (TURN_WALK * tight) ** 2
         self._rolled_m = self._rolled_m + size * dt_s if size > STANDING_MPS else 0.0
         yields = math.exp(-self._rolled_m / (YIELDING_RATIO * self._robot.wheel_radius_m))
