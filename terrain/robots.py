@@ -884,6 +884,8 @@ IDENTIFIED: Mapping[str, float | None] = {
     "imu_pitch_rad": -math.inf,
     "imu_yaw_rad": -math.inf,
     "gnss_std_m": None,
+    "pose_std_m": None,
+    "lidar_std_mps": None,
     "wheel_speed_std_mps": None,
     "torque_per_current_nmpa": None,
     "resistance_n": None,

@@ -362,10 +362,10 @@ def _laid_out(run: RunLog, robot: Robot, source: str, leg_s: float) -> dict[str,
         end_s = np.bincount(end_of, seen.time_s[near], minlength=n) / count
     pairs = np.arange(max(n - STRIDES, 0))[:, None] + [0, STRIDES]
     whole = (count[pairs] > 0).all(axis=1) & (broken[pairs[:, 0]] == broken[pairs[:, 1]])
-    for stamps_s in gap_s:
+    for stamps_s in gap_s:  # of the gyro last, where there is one
         long_s = stamps_s[1:][np.diff(stamps_s) > MAX_GAP_S]
-        ends = np.searchsorted(long_s, at_s)
-        whole &= ends[pairs[:, 0]] == ends[pairs[:, 1]]
+        gaps = np.searchsorted(long_s, at_s)
+        whole &= gaps[pairs[:, 0]] == gaps[pairs[:, 1]]
     first, then = pairs[whole].T
     moved, turned_by = (x + 1j * y)[then] - (x + 1j * y)[first], yaw[then] - yaw[first]
     if source != "gnss":
@@ -383,6 +383,7 @@ def _laid_out(run: RunLog, robot: Robot, source: str, leg_s: float) -> dict[str,
         "stamps_s": seen.time_s[near],
         "end_of": end_of,
         "n_ends": np.array([n]),
+        "gaps": gaps[first],
         "pairs": pairs[whole],
         "middle_s": 0.5 * (end_s[first] + end_s[then]),
         "moved": moved,
@@ -408,18 +409,25 @@ def lay_out(runs: Sequence[RunLog], robot: Robot, source: str, leg_s: float | No
         np.median(np.diff(run.streams[source].time_s)) for run in runs if len(run.streams.get(source, ())) > 1
     ]
     chosen_s = max(LEG_S[source] if leg_s is None else leg_s, 2.0 * float(np.median(period_s or [0.0])))
-    parts, used, why, from_s = list[dict[str, Array]](), list[RunLog](), "", 0.0
-    n_ends, n_blocks = 0, 0
+    parts, used, why = list[dict[str, Array]](), list[RunLog](), ""
     for run in runs:
         part = _laid_out(run, robot, source, chosen_s)
-        if isinstance(part, str):
-            why = why or f"run {run.run_id}: {part}"
-            continue
-        if not len(part["pairs"]):  # it takes time and shows nothing
-            why = (
-                why or f"run {run.run_id}: it has no leg of {chosen_s:g} s with {WORDS[source]} at both ends"
-            )
-            continue
+        if not isinstance(part, str) and len(part["pairs"]):
+            parts.append(part)
+            used.append(run)
+        elif not why:
+            nothing = f"it has no leg of {chosen_s:g} s with {WORDS[source]} at both ends"
+            why = f"run {run.run_id}: {part if isinstance(part, str) else nothing}"
+    if not parts:
+        raise DataError(why or f"robot {robot.name}: no run has {WORDS[source]} (stream {source!r})")
+    turned = [len(part["gyro_s"]) > 0 for part in parts]  # one kind of yaw for all: most runs decide
+    if 2 * sum(turned) >= len(turned):
+        parts = [part for part in parts if len(part["gyro_s"])]
+        used = [run for run, has in zip(used, turned, strict=True) if has]
+    else:
+        parts = [part | {"gyro_s": np.empty(0), "turned_rad": np.empty(0)} for part in parts]
+    from_s, n_ends, n_blocks = 0.0, 0, 0
+    for number, part in enumerate(parts):
         stamps = [part[name] for name in ("wheels_s", "stamps_s", "gyro_s", "steer_s") if len(part[name])]
         shift_s = from_s - min(each[0] for each in stamps)
         from_s = max(each[-1] for each in stamps) + shift_s + APART_S
@@ -427,22 +435,16 @@ def lay_out(runs: Sequence[RunLog], robot: Robot, source: str, leg_s: float | No
             part[name] = part[name] + shift_s
         part["end_of"], part["pairs"] = part["end_of"] + n_ends, part["pairs"] + n_ends
         n_ends += int(part.pop("n_ends")[0])
-        part["run"] = np.full(len(part["pairs"]), len(used))
-        part["clock_run"] = np.full(len(part["clock_s"]), len(used))
-        block = np.floor((part["middle_s"] - part["clock_s"][0]) / BLOCK_S).astype(int)
-        part["block"] = n_blocks + block - (block.min() if len(block) else 0)
-        n_blocks = int(part["block"].max()) + 1 if len(block) else n_blocks
-        parts.append(part)
-        used.append(run)
-    if not parts:
-        raise DataError(why or f"robot {robot.name}: no run has {WORDS[source]} (stream {source!r})")
-    if not all(len(part["gyro_s"]) for part in parts):  # one kind of yaw for all
-        for part in parts:
-            part["gyro_s"], part["turned_rad"] = np.empty(0), np.empty(0)
+        part["run"] = np.full(len(part["pairs"]), number)
+        part["clock_run"] = np.full(len(part["clock_s"]), number)
+        time = np.floor((part["middle_s"] - part["clock_s"][0]) / BLOCK_S)
+        block = np.unique([time, part.pop("gaps")], axis=1, return_inverse=True)[1].ravel()
+        part["block"] = n_blocks + block
+        n_blocks += int(block.max()) + 1
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     variance, has_yaw = joined.pop("variance"), bool(joined.pop("has_yaw").all())
-    usual = float(np.median(variance)) if len(variance) else 1.0
-    weight = np.minimum(np.sqrt(usual / variance), 1.0) if len(variance) else variance
+    usual = float(np.median(variance))
+    weight = np.minimum(np.sqrt(usual / variance), 1.0)
     log = Log(
         tuple(used), source, **joined, weight=weight, std_m=math.sqrt(usual), sharp=0.5, has_yaw=has_yaw
     )

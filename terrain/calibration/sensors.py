@@ -343,6 +343,8 @@ NOISE: Mapping[str, tuple[str, Sequence[str]]] = {
     "camera.yaw_rate_std_radps": ("", SEEN[2:3]),
     "camera.yaw_std_rad": ("", SEEN[3:]),
     "identified.gnss_std_m": ("gnss", ("position_x_m", "position_y_m")),
+    "identified.pose_std_m": ("pose", ("position_x_m", "position_y_m")),
+    "identified.lidar_std_mps": ("lidar", TWIST[:2]),
 }
 
 

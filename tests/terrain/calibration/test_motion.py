@@ -470,6 +470,26 @@ def test_without_a_fix_or_rest_alone_every_number_has_its_reason():
     assert all(not row.determined and row.note for row in found)
 
 
+def test_one_run_without_a_gyro_or_with_a_gap_of_it_does_not_spoil_the_others():
+    def of_imu(run, kept):
+        s = run.streams["imu"]
+        imu = {"imu": Stream(s.time_s[kept(s.time_s)], s.values[kept(s.time_s)], s.channels)}
+        return replace(
+            run, streams={n: v for n, v in run.streams.items() if n != "imu"} | (imu if kept(10.0) else {})
+        )
+
+    runs = rtk_runs(6)
+    some = [
+        of_imu(runs[0], lambda at_s: at_s < 0.0),
+        of_imu(runs[1], lambda at_s: (at_s < 20.0) | (at_s > 24.0)),
+    ]
+    found = by_name(motion_findings([*some, *runs[2:]], HUSKY, ("asphalt",)))
+    assert "run_000" not in found["effective_track_m"].runs
+    for name in ("effective_track_m", "rolling_radius_m", "gnss_delay_s"):
+        half = (found[name].high - found[name].low) / 2
+        assert abs(found[name].value - RTK_TRUTH[name]) < 1.5 * half, name
+
+
 def test_straight_driving_shows_the_radius_alone():
     straight = by_name(motion_findings(rtk_runs(turning=0.0), HUSKY, ("asphalt",)))
     assert straight["rolling_radius_m"].determined
