@@ -64,8 +64,8 @@ class Settings(SoilSettings, OdometrySettings, RobotSettings, RunsSettings):
     """What is calibrated, and what is written."""
 
     what: Literal["robot", "odometry", "soil"] = setting("robot")
-    """A robot's description, of any drive, by poses, lidar, satellites or camera; slip-compensated odometry of a tracked
-    robot; the soil of a wheel testbed."""
+    """A robot's description, of any drive, by poses, lidar, satellites or camera; slip-compensated odometry of a
+    tracked robot; the soil of a wheel testbed."""
     robot: str | None = setting(None, "Robot by name, or its YAML file, to start from; of a soil none.")
     out: Path | None = setting(None)
     """New YAML file of the robot or of the slip model; of a soil a folder with a file a wheel."""
