@@ -53,6 +53,7 @@ MAX_STD_OF_FIX_M = 1.0
 #: the sign of the steering is turned: sound wheels that slip contradict each other by 0.02.
 CONTRADICTION, OVER_TURNED = 0.05, 3.0
 MIN_ACCELERATION_MPS2 = 0.15
+MIN_TILT_RATE_RADPS = 0.003  #: Means of a second; noise of both is less
 MIN_TILT_RAD = 0.02  #: Less is that of a floor, and of offsets.
 MIN_CERTAIN_POINTS = (
     50  #: A run of 10 s; of a shorter one, noise and a shift of clocks may look like a mistake
@@ -128,6 +129,7 @@ def motion_findings(run: RunLog, robot: Described) -> list[Finding]:
         *_compared(sources, robot),
         *_still_positions(run, sources),
         *_attitude(run, grid_s),
+        *_tilt_rates(run, grid_s),
         *_steering(run, robot, grid_s),
         *_receiver(run),
         *_currents(run, robot),
@@ -622,6 +624,33 @@ def _attitude(run: RunLog, grid_s: Array) -> list[Finding]:
             found.append(Finding("attitude", 2, name, ratio, f"{of}: in degrees?"))
         else:
             found.append(Finding("attitude", 0, name, ratio, of))
+    return found
+
+
+def _tilt_rates(run: RunLog, grid_s: Array) -> list[Finding]:
+    """Compare the gyro about x and y with how the tilt that gravity shows changes, on rough ground or slopes."""
+    imu, steps, found = run.streams.get("imu"), round(MEAN_S / STEP_S), []
+    for about, axis, sign in (("x", "y", 1.0), ("y", "x", -1.0)):
+        names = f"gyro_{about}_radps", f"accel_{axis}_mps2"
+        if imu is None or not set(names) <= set(imu.channels) or len(grid_s) < 2 * steps:
+            continue
+        gyro, force = (_change(imu.time_s, imu.channel(name), grid_s, of_rate=True) for name in names)
+        tilt_rad = sign * force / GRAVITY_MPS2
+        change_radps = (tilt_rad[steps:] - tilt_rad[:-steps]) / MEAN_S
+        mean_radps = np.convolve(gyro, np.ones(steps + 1) / (steps + 1), "valid")
+        by = _compare_changes(mean_radps, change_radps)
+        if not by.is_known or by.least < MIN_TILT_RATE_RADPS:
+            continue
+        factor = math.copysign(by.ratio, by.cosine)
+        of = f"tilt: the gyro about {about} shows {factor:.3g} times the change of tilt that gravity shows"
+        if factor < 0.0:
+            found.append(
+                Finding("tilt", 2, names[0], factor, f"{of}: a turned axis of the gyro or accelerometer?")
+            )
+        elif factor > IMPLAUSIBLE_RATIO**2:
+            found.append(Finding("tilt", 2, names[0], factor, f"{of}: a gyro in deg/s read as rad/s?"))
+        else:
+            found.append(Finding("tilt", 0, names[0], factor, of))
     return found
 
 

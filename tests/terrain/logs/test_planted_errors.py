@@ -84,7 +84,8 @@ def rolling(run):
     """Return a run over slopes to either side, as its IMU shows them."""
     old = run.streams["imu"]
     roll_rad = 0.12 * np.sin(0.4 * old.time_s)
-    added = {"roll_rad": roll_rad, "accel_y_mps2": 9.81 * np.sin(roll_rad)}
+    rate_radps = 0.12 * 0.4 * np.cos(0.4 * old.time_s)
+    added = {"roll_rad": roll_rad, "gyro_x_radps": rate_radps, "accel_y_mps2": 9.81 * np.sin(roll_rad)}
     values = old.values + np.column_stack([added.get(name, 0.0 * roll_rad) for name in old.channels])
     return replace(run, streams={**run.streams, "imu": replace(old, values=values)})
 
@@ -119,6 +120,13 @@ PLANTED = [
     ("agrimaro", scaled("imu", 1 / DEGREE, "roll", "pitch"), BAD, "in degrees?"),
     ("agrimaro", lambda run: scaled("imu", -1.0, "roll")(rolling(run)), BAD, "roll_rad of imu is -0.9"),
     ("agrimaro", lambda run: scaled("imu", 1 / DEGREE, "roll")(rolling(run)), BAD, "in degrees?"),
+    (
+        "agrimaro",
+        lambda run: scaled("imu", 1 / DEGREE, "gyro_x")(rolling(run)),
+        BAD,
+        "a gyro in deg/s read as rad/s?",
+    ),
+    ("agrimaro", lambda run: scaled("imu", -1.0, "gyro_x")(rolling(run)), BAD, "a turned axis of the gyro"),
     ("orchard_ugv", scaled("pose", 1e3, "position"), BAD, "speed: that of pose is 99"),
     ("orchard_ugv", scaled("pose", 1e2, "position"), BAD, "cm?"),
     (
@@ -159,7 +167,9 @@ PLANTED = [
 
 def test_a_sound_run_over_slopes_has_no_doubt():
     assert {
-        str(check.level) for check in judged(rolling(sound("agrimaro"))) if check.check == "attitude"
+        str(check.level)
+        for check in judged(rolling(sound("agrimaro")))
+        if check.check in ("attitude", "tilt")
     } == {"ok"}
 
 
