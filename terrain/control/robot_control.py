@@ -258,11 +258,15 @@ SPEED_MPS, SPEED_RATIO, STEER_RAD = 0.05, 0.06, 0.06
 class Actuation:
     """Wheels and steering of a robot against their commands, step by step: which (wheels + angles,) are ``off``.
 
-    ``mps_per_rate`` is the speed of a wheel by what its channel holds, the rate of its motor or the speed itself.
+    ``mps_per_rate`` is the speed of a wheel by what its channel holds, the rate of its motor or the speed itself.  The
+    ground drives the sides of a robot that skids against each other, beyond what their motors can hold: one that moves
+    is compared with the commands of both, and 0.
     """
 
-    def __init__(self, mps_per_rate: float, n_wheels: int = 3, n_angles: int = 3) -> None:
-        self._mps_per_rate, self._n, n = mps_per_rate, n_wheels, (n_wheels, n_angles)
+    def __init__(
+        self, mps_per_rate: float, n_wheels: int = 3, n_angles: int = 3, skids: bool = False
+    ) -> None:
+        self._mps_per_rate, self._n, n, self._skids = mps_per_rate, n_wheels, (n_wheels, n_angles), skids
         self._tolerance, self._ratio = np.repeat([SPEED_MPS, STEER_RAD], n), np.repeat([SPEED_RATIO, 0.0], n)
         self._still_s = np.repeat([STILL_S, math.inf], n)  # a steering angle may repeat itself
         size = sum(n)
@@ -299,6 +303,10 @@ class Actuation:
         known = counts.any(axis=0)
         low = np.where(known, np.where(counts, commands, math.inf).min(axis=0), 0.0)
         high = np.where(known, np.where(counts, commands, -math.inf).max(axis=0), 0.0)
+        if self._skids:
+            moves, sides = self._repeated_s < STILL_S, slice(0, self._n)
+            low = np.where(moves, np.minimum(low[sides].min(), 0.0), low)
+            high = np.where(moves, np.maximum(high[sides].max(), 0.0), high)
         slack = self._tolerance + self._ratio * np.maximum(np.abs(low), np.abs(high))
         below, above = known & (smooth < low - slack), known & (smooth > high + slack)
         goes = ~((below & (smooth > slow + APPROACH)) | (above & (smooth < slow - APPROACH)))
@@ -313,6 +321,7 @@ _OF_SLIP = tuple(SENSORS.index(name) for name in SLIP_SENSORS)
 # Order in which sensors are named, by health: one that steps or freezes takes others with it, which are lost.
 _NAMED_FIRST = (0, 1, 2, 3, 4, 6, 7, 5)
 _GYRO, _SEEN, _SEEN_YAW = (SENSORS.index(name) for name in ("gyro", "camera_speed", "camera_yaw"))
+FRESH_S = 0.5  #: Age of a measured speed over ground up to which a robot counts as slow.
 LOST_S = 0.1  #: Without a sample of the wheels for so long they are lost.
 POSE_STATES = ("position_x_m", "position_y_m", "yaw_rad")  #: Of a filter that path tracking is built on.
 _NOT_TRACKED = TrackReport(math.nan, math.nan, 0.0, TrackStatus.NO_POSE)
@@ -365,7 +374,7 @@ class RobotControl:
         n, mps_per_rate = len(robot.logged_wheels), 1.0
         if robot.by_motor:
             mps_per_rate = robot.wheel_radius_m / robot.completed.motors.reduction_ratio
-        self._actuation = Actuation(mps_per_rate, n, len(self._angles))
+        self._actuation = Actuation(mps_per_rate, n, len(self._angles), robot.skids)
         wheels, imu = (list(channels.get(name, ())) for name in ("wheels", "imu"))
         if states:
             check_channels("wheels", robot.rate_channels, wheels)
@@ -505,10 +514,11 @@ class RobotControl:
         """Return the twist for the kinematics with which a robot that turns by its wheels' speeds turns as desired."""
         if self._turning is None:
             return twist
-        turn, wheels_mps = math.nan, np.full(len(self._robot.wheels), math.nan)
+        unknown = np.full(len(self._robot.wheels), math.nan)
+        given = twist, self._driven_part, math.nan, unknown, math.nan, dt_s
         if seen is not None and sound:
-            turn, wheels_mps = seen.yaw_rate_radps, seen.wheel_speed_mps
-        given = twist, self._driven_part, turn, wheels_mps, dt_s
+            speed_mps = seen.speed_x_mps if seen.reference_age_s < FRESH_S else math.nan
+            given = *given[:2], seen.yaw_rate_radps, seen.wheel_speed_mps, speed_mps, dt_s
         twist, self._turn = turn_step(TURN, self._turning, self._turn, *given)
         return twist
 

@@ -15,6 +15,9 @@ controller drives the part p, behind the lag of the robot, and the measured one 
 - The integral removes what is left: a side on softer ground, unequal radii.  The correction is bounded by a part of the
   wheels' speed, and by the speed at which a wheel would reverse.  Where it is bounded, or a wheel is at its motor's
   limit, the integral does not grow; at rest it is 0.
+- A turn can take more than the ground or the motors give: the robot slips by more than a bound, and more speed of its
+  wheels gives hardly more thrust, or a wheel stays behind its command.  It would cost the robot its speed: x and the
+  integral fall then, towards the turn that the wheels' speeds give by themselves.
 - Without a yaw rate nothing is corrected, and x stays.
 """
 
@@ -46,10 +49,18 @@ class TurnSettings(NamedTuple):
     turning_radps: float = 0.05
     angle_rad: float = 0.5
     least_ratio: float = 0.8
-    most_ratio: float = 4.0
+    most_ratio: float = 3.0
+    most_slip_ratio: float = 0.5  #: of the robot; with more the ground gives hardly more thrust
+    follow_s: float = 0.3  #: within which wheels follow their commands
+    relief_s: float = 0.3  #: within which a turn that takes too much is given up
 
 
 SETTINGS = TurnSettings()
+_BEHIND_RATIO, _BEHIND_MPS = (
+    0.15,
+    0.05,
+)  # by which a wheel is behind its command whose motor gives all its torque
+_AHEAD = 0.2  # mean speed of the wheels over that of the fastest, below which a robot turns on the spot
 
 
 class TurnState(NamedTuple):
@@ -58,6 +69,9 @@ class TurnState(NamedTuple):
     track_ratio: float = 1.0  #: x
     integral_radps: float = 0.0
     reference_radps: float = 0.0  #: w_r
+    commanded_mps: Array | None = (
+        None  #: (wheels,) speeds that were commanded, behind a low-pass; None at first
+    )
 
 
 class Turning(NamedTuple):
@@ -95,6 +109,7 @@ def turn_step(
     driven_part: float,
     yaw_rate_radps: float,
     wheel_speed_mps: Array,
+    speed_mps: float,
     dt_s: float,
 ) -> tuple[Array, TurnState]:
     """Return the twist (3,) for the kinematics, within what the motors can do, and the next state.
@@ -105,31 +120,40 @@ def turn_step(
     turning : of the robot
     twist : (3,) desired
     driven_part : of the desired speed that was commanded in the step before, 0 to 1
-    yaw_rate_radps, wheel_speed_mps : estimated, and (wheels,) measured; NaN where unknown
+    yaw_rate_radps, wheel_speed_mps, speed_mps : estimated, (wheels,) measured, and ahead over ground; NaN where unknown
     dt_s : since the step before
 
     Examples
     --------
     >>> from terrain.robots import load_robot
     >>> turning, ahead = turning_of(load_robot("husky")), np.array([0.5, 0.0, 0.4])
-    >>> slow = ahead, 1.0, 0.3, np.array([0.4, 0.6]), 0.02
+    >>> slow = ahead, 1.0, 0.3, np.array([0.4, 0.6]), 0.5, 0.02
     >>> turn_step(SETTINGS, turning, TurnState(reference_radps=0.4), *slow)[0].round(3)
     array([0.5  , 0.   , 0.434])
     """
-    ratio, integral, reference = state
+    ratio, integral, reference, commanded = state
+    commanded = np.zeros(len(wheel_speed_mps)) if commanded is None else commanded
     desired = float(twist[2])
     if not 0.0 < dt_s <= LONGEST_STEP_S:
         yaw_rate_radps, dt_s = math.nan, 0.0
     reference += (driven_part * desired - reference) * -math.expm1(-dt_s / settings.lag_s)
     error = reference - yaw_rate_radps
+    mean_mps, fastest = float(wheel_speed_mps.mean()), float(np.abs(wheel_speed_mps).max())
+    spins = turning.skids and abs(mean_mps) > _AHEAD * fastest
+    spins = spins and 1.0 - speed_mps / mean_mps > settings.most_slip_ratio  # False for NaN
+    follows = np.sign(commanded) * wheel_speed_mps - (1.0 - _BEHIND_RATIO) * np.abs(commanded)
+    strained = spins or bool((follows < -_BEHIND_MPS).any())
     if turning.skids and abs(yaw_rate_radps) > settings.turning_radps:
         left, right = turning.rolling[:, 2].tolist()
         rolled = float(wheel_speed_mps[1] - wheel_speed_mps[0]) / (right - left)
         shown = min(max(rolled / yaw_rate_radps, settings.least_ratio), settings.most_ratio)
         turned = min(abs(rolled) * dt_s / settings.angle_rad, 1.0)
-        if math.isfinite(rolled):
+        if math.isfinite(rolled) and not (strained and shown > ratio):
             ratio += (shown - ratio) * turned
             integral = state.track_ratio / ratio * (desired + integral) - desired
+    if turning.skids and strained:
+        keep = math.exp(-dt_s / settings.relief_s)
+        ratio, integral = 1.0 + keep * (ratio - 1.0), keep * integral
     arms = ratio * turning.rolling[:, 2]
     speeds = turning.rolling[:, :2] @ twist[:2] + arms * desired
     fastest = float(np.abs(speeds).max())
@@ -145,10 +169,15 @@ def turn_step(
         grown = integral + settings.k_i_ps * error * dt_s
         asked = settings.k_p * error + grown
         added = min(max(asked, -least), most)
-        bounded = asked != added or fastest + float(np.abs(arms).max()) * abs(added) > turning.limit_mps
+        bounded = (
+            spins or asked != added or fastest + float(np.abs(arms).max()) * abs(added) > turning.limit_mps
+        )
         if not (bounded and asked * error > 0.0):
             integral = grown
     integral = min(max(integral, -least), most)
     given = np.array([twist[0], twist[1], ratio * (desired + added)])
     over = float(np.abs(turning.rolling @ given).max()) / turning.limit_mps
-    return given / max(over, 1.0), TurnState(ratio, integral, reference)
+    given = given / max(over, 1.0)
+    part = -math.expm1(-dt_s / settings.follow_s)
+    commanded = commanded + part * (driven_part * (turning.rolling @ given) - commanded)
+    return given, TurnState(ratio, integral, reference, commanded)

@@ -408,7 +408,8 @@ def learning_run(
 ) -> RunLog:
     """Return one run, ``number`` from 1 on; its drive is by default one of :func:`learning_drives` in turn.
 
-    Robots of other drives than swerve have a satellite receiver, beside a camera where one is described.
+    Robots of other drives than swerve have a satellite receiver, beside a camera where one is described; those on omni
+    wheels, which may head anywhere, are seen from outside.
     """
     robot = with_assumed(robot)
     if drive is None:
@@ -429,6 +430,7 @@ def learning_run(
         conditions=draw_conditions(rng, ground, robot),
         controller=SlipSweep(robot) if drive.kind == "sweep" else None,
         gnss=None if isinstance(robot, SwerveRobot) else Gnss(),
+        poses=poses_of(robot) if robot.on_omni_wheels else None,
     )
 
 

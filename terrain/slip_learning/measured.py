@@ -72,7 +72,7 @@ from terrain.kinematics.logged_wheels import speed_columns
 from terrain.kinematics.wheels import no_slip_twist, point_velocity, rolling_matrix
 from terrain.logs.schema import POSE_CHANNELS, TWIST
 from terrain.records import Array, RunLog, SlipTrack, Stream
-from terrain.robots import Robot, robot_named
+from terrain.robots import BicycleRobot, Robot, robot_named
 from terrain.signals import Delay, DelayStatus, common_delay
 from terrain.slip import slip_ratio
 from terrain.slip_learning.sessions import IntervalOf, SessionSlip, session_slips
@@ -391,6 +391,7 @@ def measured_slip(
     along = (rolling * twist[:, None, :]).sum(axis=-1)
     along_std = np.sqrt(((rolling * twist_std[:, None, :]) ** 2).sum(axis=-1))
     slip, slip_std = _slip(u, u_std, along, along_std)
+    slip[:, ~np.isin(robot.wheels, robot.logged_wheels)] = np.nan
     rollers = robot.on_omni_wheels, robot.roller_angles_rad
     rolled_twist, _ = no_slip_twist(place_m, direction, u, *rollers)
     speed = np.linalg.norm(rolled_twist[:, :2], axis=1)
@@ -439,16 +440,27 @@ def _rolled(time_s: Array, speeds_mps: Array) -> tuple[Array, Array, Array]:
 def wheel_speeds(run: RunLog, robot: Robot) -> tuple[Array, Array]:
     """Return times (n,) and circumferential speeds (n, wheels) of a run's wheels.
 
+    The wheel of a car-like robot that is not driven, and not logged, rolls with the other one.
+
     Raises
     ------
     DataError
         if the run has none, or fewer than two samples.
     """
-    names = [f"speed_{wheel}_mps" for wheel in robot.wheels]
-    wheels = run.streams.get("wheels")
+    names = [f"speed_{wheel}_mps" for wheel in robot.logged_wheels]
+    wheels, steering = run.streams.get("wheels"), run.streams.get("steering")
     if wheels is None or not set(names) <= set(wheels.channels) or len(wheels) < 2:
         raise DataError(f"run {run.run_id}: has no wheel speeds ({', '.join(names)}) of two samples or more")
-    return wheels.time_s, wheels.columns(names)
+    speeds = wheels.columns(names)
+    if isinstance(robot, BicycleRobot):
+        cos = np.ones(len(wheels))
+        if steering is not None and robot.steer_channels[0] in steering.channels:
+            angle = np.interp(wheels.time_s, steering.time_s, steering.channel(robot.steer_channels[0]))
+            cos = np.cos(angle - robot.steering_zeros_rad[0])
+        driven = speeds[:, 0]
+        both = (driven, driven * cos) if robot.front_driven else (driven / cos, driven)
+        return wheels.time_s, np.column_stack(both)
+    return wheels.time_s, speeds
 
 
 def wheel_directions(run: RunLog, robot: Robot, start_s: Array, end_s: Array) -> Array:

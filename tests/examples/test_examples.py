@@ -73,7 +73,7 @@ class Publisher:
         self.messages = []
 
     def publish(self, message):
-        self.messages.append(message.data)
+        self.messages.append(getattr(message, "data", message))
 
 
 class Node:
@@ -100,6 +100,13 @@ def ros(monkeypatch):
     module("rclpy", node=module("rclpy.node", Node=Node))
     for package, kinds in (("sensor_msgs", ("Imu", "JointState")), ("std_msgs", ("Float64", "String"))):
         module(package, msg=module(f"{package}.msg", **dict.fromkeys(kinds, SimpleNamespace)))
+    module(
+        "geometry_msgs", msg=module("geometry_msgs.msg", Twist=twist_message, TwistStamped=SimpleNamespace)
+    )
+
+
+def twist_message():
+    return SimpleNamespace(linear=vector([0.0] * 3), angular=vector([0.0] * 3))
 
 
 def stamp(time_s):
@@ -135,6 +142,29 @@ def test_the_ros_node_publishes_terrain_and_target_slip(ros, runs, model_folder)
     assert len(terrain) == len(target) >= 5
     assert terrain[-1] == "b"
     assert all(0.0 < slip < 1.0 for slip in target)
+
+
+def test_the_ros_node_of_a_robot_publishes_the_twist_to_drive_and_its_wheels(ros, model_folder):
+    node = example("ros2_node").terrain_node(model_folder, "husky")
+    desired = SimpleNamespace(linear=vector([0.5, 0.0, 0.0]), angular=vector([0.0, 0.0, 0.3]))
+    for k in range(200):
+        time_s, turn = 0.02 * k, vector([0.0, 0.0, 0.1])  # it turns by a third of what is desired
+        imu = SimpleNamespace(
+            header=stamp(time_s), angular_velocity=turn, linear_acceleration=vector([0.0, 0.0, 9.8])
+        )
+        rates = [0.4 / 0.165, 0.6 / 0.165]
+        joints = SimpleNamespace(
+            header=stamp(time_s), name=["left_wheel", "right_wheel"], velocity=rates, effort=[]
+        )
+        moves = SimpleNamespace(header=stamp(time_s), twist=SimpleNamespace(linear=vector([0.49, 0.0, 0.0])))
+        for topic, message in (("imu/data", imu), ("joint_states", joints), ("fix_velocity", moves)):
+            node.callbacks[topic](message)
+        node.callbacks["cmd_vel_desired"](desired)
+    driven, wheels = node.publishers["cmd_vel"].messages[-1], node.publishers["wheel_commands"].messages[-1]
+    assert driven.linear.x == pytest.approx(0.5)
+    assert driven.angular.z > 0.35
+    assert wheels.name == ["left", "right"]
+    assert wheels.velocity[0] < wheels.velocity[1]
 
 
 def test_slip_changes_with_the_ground_sample_by_sample():

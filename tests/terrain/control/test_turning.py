@@ -12,12 +12,13 @@ HUSKY = load_robot("husky")
 TURNING, ARM_M, DT_S = turning_of(HUSKY), 0.2854, 0.02
 
 
-def steps(twist, yaw_rate, n=1, state=None, wheels=None, part=1.0, turning=TURNING):
+def steps(twist, yaw_rate, n=1, state=None, wheels=None, part=1.0, turning=TURNING, speed=math.nan):
     """The twist for the kinematics after n steps with one measured yaw rate, and the state."""
     state = TurnState(reference_radps=twist[2]) if state is None else state
     wheels = np.full(len(turning.rolling), math.nan) if wheels is None else np.array(wheels)
     for _ in range(n):
-        given, state = turn_step(SETTINGS, turning, state, np.array(twist), part, yaw_rate, wheels, DT_S)
+        now = np.array(twist), part, yaw_rate, wheels, speed, DT_S
+        given, state = turn_step(SETTINGS, turning, state, *now)
     return given, state
 
 
@@ -56,9 +57,9 @@ def test_at_rest_nothing_is_left_of_a_correction():
 def test_without_a_yaw_rate_or_a_time_the_twist_is_that_of_the_effective_track():
     state = TurnState(1.5, 0.1, 0.4)
     for yaw_rate, dt_s in ((math.nan, DT_S), (0.1, math.nan), (0.1, 3.0)):
-        given, after = turn_step(
-            SETTINGS, TURNING, state, np.array([0.5, 0.0, 0.4]), 1.0, yaw_rate, np.full(2, math.nan), dt_s
-        )
+        unknown = np.full(2, math.nan)
+        now = np.array([0.5, 0.0, 0.4]), 1.0, yaw_rate, unknown, math.nan, dt_s
+        given, after = turn_step(SETTINGS, TURNING, state, *now)
         assert given == pytest.approx([0.5, 0.0, 0.6])
         assert after.track_ratio == 1.5
         assert after.integral_radps == pytest.approx(0.1)
@@ -70,14 +71,13 @@ def test_no_wheel_is_asked_for_more_than_its_motor_gives_and_the_turning_centre_
     assert given[2] / given[0] == pytest.approx(0.4)
 
 
-@pytest.mark.parametrize("ratio", [1.3, 1.9, 3.0])
+@pytest.mark.parametrize("ratio", [1.3, 1.9, 2.6])
 def test_the_effective_track_comes_back_and_a_described_one_is_used_at_once(ratio):
     """A robot that turns by the speeds of its sides over its effective track, behind a lag."""
     state, yaw_rate, wheels = first_state(HUSKY), 0.0, np.zeros(2)
     for _ in range(600):
-        given, state = turn_step(
-            SETTINGS, TURNING, state, np.array([0.4, 0.0, 0.5]), 1.0, yaw_rate, wheels, DT_S
-        )
+        now = np.array([0.4, 0.0, 0.5]), 1.0, yaw_rate, wheels, 0.4, DT_S
+        given, state = turn_step(SETTINGS, TURNING, state, *now)
         wheels = wheels + (TURNING.rolling @ given - wheels) * DT_S / 0.1
         yaw_rate += ((wheels[1] - wheels[0]) / (2.0 * ARM_M * ratio) - yaw_rate) * DT_S / 0.1
     assert state.track_ratio == pytest.approx(ratio, rel=0.05)
@@ -90,3 +90,15 @@ def test_the_turn_of_omni_wheels_has_no_effective_track():
     _, state = steps((0.2, 0.1, 0.4), 0.2, 100, wheels=(0.1, 0.1, 0.1), turning=turning)
     assert state.track_ratio == 1.0
     assert state.integral_radps > 0.0
+
+
+def test_where_the_robot_is_slow_beside_its_wheels_its_turn_takes_no_more():
+    state = TurnState(2.5, 0.05, 0.4)
+    slips, grips = (
+        steps((0.5, 0.0, 0.4), 0.1, 50, state=state, wheels=(0.2, 0.8), speed=speed)[1]
+        for speed in (0.2, 0.4)
+    )
+    assert slips.track_ratio < 1.6
+    assert grips.track_ratio > 2.5
+    on_the_spot = steps((0.0, 0.0, 0.6), 0.1, 50, state=state, wheels=(-0.5, 0.5), speed=0.0)[1]
+    assert on_the_spot.track_ratio > 2.5
