@@ -44,7 +44,7 @@ def terrain_node(model: Path, robot_name: str = "") -> Node:
     twist = node.create_publisher(Twist, "cmd_vel", 1)
     wheels = node.create_publisher(JointState, "wheel_commands", 1)
 
-    def tell() -> None:
+    def publish_belief() -> None:
         terrain.publish(String(data=chain.belief.terrain))
         target.publish(Float64(data=chain.table.lookup(chain.belief.terrain)["traction"].slip_ratio))
 
@@ -53,7 +53,7 @@ def terrain_node(model: Path, robot_name: str = "") -> Node:
         reading = Reading(np.array([time_s]), np.array([values]))
         if robot is None:
             if chain.update({stream: reading}):
-                tell()
+                publish_belief()
             return
         earlier = waiting.get(stream)
         waiting[stream] = reading if earlier is None else Reading(*map(np.concatenate, zip(earlier, reading, strict=True)))
@@ -68,7 +68,7 @@ def terrain_node(model: Path, robot_name: str = "") -> Node:
         twist.publish(out)
         wheels.publish(JointState(name=list(robot.wheels), velocity=done.command.wheel_radps.tolist()))
         if done.windows:
-            tell()
+            publish_belief()
 
     def on_imu(message: Imu) -> None:  # axes of REP 103, as in the run logs
         turn, accel = message.angular_velocity, message.linear_acceleration
