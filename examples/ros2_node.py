@@ -2,7 +2,7 @@
 
 It publishes the terrain and its target slip.  With a robot, by name or its YAML file, it drives: for each desired twist
 on ``cmd_vel_desired`` it publishes the twist to drive on ``cmd_vel``, and the rates of the driven wheels on
-``wheel_commands``.  A robot whose driver takes a twist is given the first, one whose motors take rates the second.
+``wheel_commands``: of motor controllers that take a twist the first is used, of those that take rates the second.
 """
 
 import math
