@@ -415,6 +415,18 @@ def test_a_slow_receiver_shows_the_same():
         assert abs(slow[name].value - fast[name].value) < (slow[name].high - slow[name].low)
 
 
+def test_delays_by_a_receiver_are_wide_where_the_ground_may_be_soft():
+    runs = rtk_runs(4)
+    hard, soft = (
+        by_name(motion_findings(some, HUSKY, ("asphalt",)))
+        for some in (runs, [replace(r, labels=()) for r in runs])
+    )
+    for name in ("wheels_delay_s", "gnss_delay_s"):
+        assert soft[name].high - soft[name].low > 0.35 > 0.05 > hard[name].high - hard[name].low, name
+        assert soft[name].low < RTK_TRUTH[name] < soft[name].high
+        assert "on soft ground" in soft[name].note
+
+
 def test_a_gyro_without_rest_has_its_bias_by_the_receiver():
     made = [rtk_run(70 + k, rest_s=0.0, bias_radps=0.01 + 0.002 * np.sin(k)) for k in range(5)]
     fitted = fit_motion([run for run, _ in made], HUSKY, "gnss")
