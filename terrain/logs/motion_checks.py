@@ -40,9 +40,8 @@ MAX_OTHER_LIKENESS = 0.3  #: A regular to and fro is like both signs at some shi
 DOUBTFUL_RATIO = 1.5
 DOUBTFUL_TURN_RATIO = 2.0  #: Scans that were matched in turns are off by more than positions.
 IMPLAUSIBLE_RATIO = 3.0
-#: Ground speed over that of wheels: they slip by any part, so that less than so much is doubtful.
+#: Ground speed over that of wheels: they slip by any part, so that less than so much is doubtful, and no more.
 LEAST_OF_WHEELS = 0.3
-IMPLAUSIBLE_OF_WHEELS = 1.0 / 30.0
 #: Part of the power of the velocity along the body's x axis, of a robot that cannot drive sideways.
 MIN_AHEAD = (0.5, 0.1)
 STILL_M = 5e-4  #: No receiver's positions stay within this for seconds, the robot's being stuck or not.
@@ -311,6 +310,7 @@ class Likeness(NamedTuple):
     ratio: float = math.nan  #: of their root mean squares, measured over reference
     other: float = 0.0  #: the best cosine of the other sign
     least: float = 0.0  #: the smaller of both root mean squares
+    most: float = 0.0  #: the larger
     n: int = 0
 
     @property
@@ -333,7 +333,9 @@ def _compare(measured: Array, reference: Array, *, about_mean: bool = False) -> 
         if about_mean:
             m, r = m - m.mean(axis=0), r - r.mean(axis=0)
         cosine = float(agreement(m.reshape(-1, 1), r.reshape(-1, 1))[0][0])
-        fits.append(Likeness(cosine, of_m / of_r if of_r else math.inf, 0.0, min(of_m, of_r), n))
+        fits.append(
+            Likeness(cosine, of_m / of_r if of_r else math.inf, 0.0, min(of_m, of_r), max(of_m, of_r), n)
+        )
     if not fits:
         return Likeness()
     best = max(fits, key=lambda fit: abs(fit.cosine))
@@ -404,14 +406,16 @@ def _speeds(sources: Sequence[Seen], robot: Described) -> list[Finding]:
             IMPLAUSIBLE_RATIO,
         )
         if middle == WHEELS:
-            low, least = LEAST_OF_WHEELS, IMPLAUSIBLE_OF_WHEELS
+            low, least = LEAST_OF_WHEELS, 0.0
         elif name == WHEELS:
-            high, most = 1.0 / LEAST_OF_WHEELS, 1.0 / IMPLAUSIBLE_OF_WHEELS
-        if not math.isfinite(by.ratio) or by.least * max(by.ratio, 1.0 / by.ratio) < MIN_SPEED_MPS:
+            high, most = 1.0 / LEAST_OF_WHEELS, math.inf
+        if not 0.0 < by.ratio < math.inf or by.most < MIN_SPEED_MPS:
             continue
         of = f"speed: that of {name} is {by.ratio:.3g} times that of {middle}"
         known = factors | dict(GNSS_FACTORS if "gnss" in (name + middle) else {})
-        odd = f"{of}, {low:.2g} to {high:.2g} is expected: {mistake(by.ratio, known)}"
+        slips = (middle == WHEELS and by.ratio < 1.0) or (name == WHEELS and by.ratio > 1.0)
+        why = "wheels that slip, or " * slips + mistake(by.ratio, known)
+        odd = f"{of}, {low:.2g} to {high:.2g} is expected: {why}"
         beyond = not least <= by.ratio <= most
         judged = _level(by.n, not low <= by.ratio <= high, beyond)
         if by.cosine < MIN_LIKENESS:  # of two steady speeds; noise of a receiver at rest is a speed, too
@@ -452,7 +456,7 @@ def _yaw_rates(sources: Sequence[Seen], robot: Described) -> list[Finding]:
             weight, measured = seen.power / norm, measured / norm
         by = _compare(measured[:, None], (rate * weight)[:, None])
         is_certain = by.is_known and (not of_course or by.n >= MIN_CERTAIN_POINTS)
-        larger = by.least * max(by.ratio, 1.0 / by.ratio) if is_certain else 0.0
+        larger = by.most if is_certain else 0.0
         # a sign is that of two turns, not of a turn and what a robot that does not mean to turn shows, as wheels do
         both = by.least >= MIN_TURN_RADPS / 2
         if larger >= MIN_TURN_RADPS and (both or (by.cosine > 0.0 and seen.name != WHEELS)):
@@ -481,10 +485,12 @@ def _turned(seen: Seen, reference: Seen, factor: float, n: int) -> Finding:
             why = "a turned sign of the steering or of the gyro, or wheels exchanged?"
     elif low <= factor <= high or seen.power is not None:
         return Finding("turns", 0, seen.name, factor, of)
-    certain = n >= MIN_CERTAIN_POINTS and not 1.0 / bound <= factor <= bound
-    return Finding(
-        "turns", 1 + certain, seen.name, factor, f"{of}, {low:.2g} to {high:.2g} is expected: {why}"
-    )
+    beyond = not 1.0 / bound <= factor <= bound
+    if seen.name == WHEELS and factor > 1.0:
+        beyond, why = False, f"wheels that slip, or {why}"
+    level = _level(n, True, beyond)
+    odd = f"{of}, {low:.2g} to {high:.2g} is expected: {why}"
+    return Finding("turns", level, seen.name, factor, odd if level else of)
 
 
 def _directions(sources: Sequence[Seen], robot: Described) -> list[Finding]:

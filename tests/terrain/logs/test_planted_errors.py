@@ -149,7 +149,7 @@ PLANTED = [
     ("agrimaro", scaled("steering", 1 / DEGREE, "angle"), BAD, "in degrees?"),
     ("agrimaro", scaled("steering", -1.0, "angle"), BAD, "a turned sign of the steering"),
     ("agrimaro", scaled("wheels", 0.1, "motor"), BAD, "before or after the reduction"),
-    ("agrimaro", scaled("wheels", 60 / (2 * np.pi), "motor"), BAD, "rpm?"),
+    ("agrimaro", scaled("wheels", 60 / (2 * np.pi), "motor"), ODD, "rpm?"),
     ("agrimaro", scaled("odometry", 1e3, "velocity"), BAD, "mm?"),
     ("robotino", scaled("wheels", 1 / 16.0, "motor"), BAD, "before or after the reduction"),
     ("robotino", scaled("pose", 1e3, "position"), BAD, "mm?"),
@@ -183,6 +183,15 @@ def test_a_planted_error_is_refused_or_stated_in_a_sentence_that_names_it(robot,
     run = plant(sound(robot))
     stated = [check for check in judged(run) if check.level in (BAD, ODD)]
     assert any(sentence in check.sentence for check in stated if check.level == level), stated
+
+
+@pytest.mark.parametrize(
+    ("robot", "terrain", "scenario"), [("robotino", "dry_sand", "brake"), ("husky", "grass", "stand")]
+)
+def test_wheels_that_spin_or_stand_are_never_refused(robot, terrain, scenario):
+    """Omni wheels slip by 0.98 in sand: wheels that are faster than the ground are at most doubtful."""
+    run = simulate_run(load_robot(robot), terrain, scenario, 7, 6, duration_s=25.0)
+    assert BAD not in {check.level for check in judged(run)}
 
 
 @pytest.mark.parametrize("plant", [scaled("odometry", 3.6, "speed"), scaled("odometry", -1.0, "speed")])
