@@ -3,18 +3,20 @@
 With the mass m, the wheel radius r, the wheelbase L, n wheels that a motor turns each and k contacts with the ground::
 
     inertia        a box of the wheelbase and track with the wheels around them, m (l^2 + w^2) / 12; of a wheel and
-                   its rotor a tenth of its share of the mass at its radius
+                   its rotor a fifth of its share of the mass at its radius
     height         r + L / 10 of the centre of mass, in the middle of the contacts
     tyres          0.6 r wide, a contact as long (a roller's of r / 4), relaxed over half of it; they sag by 0.025 r
                    under m g / k, with 0.15 of the critical damping
-    motors         a torque of m g r / n, which slips every wheel; the top speed of a Froude number v^2 / (g L) of 0.25,
+    motors         a torque of m g r / n, which slips every wheel, times 1 + L / B with the track B of robots that skid,
+                   which have to turn, too; the top speed of a Froude number v^2 / (g L) of 0.25,
                    that of a brisk walk; 3000 turns a minute there, at 5/6 of no load: k_t = V / w_0, with 24 V, from
-                   100 kg on 48 V; a speed loop of 9 rad/s on the share of the mass, integrating over 0.2 s
+                   100 kg on 48 V; a speed loop that gives all torque at half the top speed, no faster than 100 rad/s on
+                   a wheel that spins freely, integrating over 0.2 s
     steering       2 rad/s, of a car-like robot as it is described
     sensors        those of a common MEMS unit and of encoders on the motors
 
-Of the described robots of the package (0.04 to 0.2 m, 12 to 90 kg) inertia, tyres, torque, top speed and the torque of
-an ampere are within a factor of two of these, dampers, friction and the inertia of wheels within three.
+Of the described robots of the package (0.04 to 0.2 m, 12 to 90 kg) inertias, tyres, torque, top speed and the torque of
+an ampere are within a factor of two of these, dampers, friction and the gain of the speed loop within three.
 """
 
 from __future__ import annotations
@@ -32,8 +34,8 @@ from terrain.simulation.contacts import TRACK_PATCHES, contacts_of
 # That a simulation needs; a camera is on board or is not.
 SECTIONS = ("body", "motors", "steering", "sensors")
 SAG_RATIO, DAMPING_RATIO, FROUDE = 0.025, 0.15, 0.25
-ROTOR_SHARE, MOTOR_RADPS, NO_LOAD_RATIO, HEAVY_KG = 0.1, 314.0, 1.2, 100.0
-BANDWIDTH_RADPS, INTEGRAL_S = 9.0, 0.2
+ROTOR_SHARE, MOTOR_RADPS, NO_LOAD_RATIO, HEAVY_KG = 0.2, 314.0, 1.2, 100.0
+FREE_RADPS, INTEGRAL_S = 100.0, 0.2
 # Friction of motors and reductions over the largest torque, and noise of a current over the largest.
 FRICTION_RATIO, CURRENT_STD_RATIO = 0.025, 0.005
 
@@ -65,7 +67,7 @@ def with_assumed(robot: Robot) -> Robot:
     >>> from terrain.robots import SkidSteerRobot
     >>> robot = with_assumed(SkidSteerRobot("mine", 0.165, 0.57, 0.512, 50.0))
     >>> round(robot.motors.torque_max_nm), round(robot.body.tyre_stiffness_npm), "body.com_x_m" in robot.assumed
-    (40, 29717, True)
+    (77, 29717, True)
     """
     for name in SECTIONS:
         if robot.describes(name) or (name == "steering" and not robot.steered):
@@ -120,10 +122,12 @@ def _motors(robot: Robot) -> dict[str, float]:
     """Return the numbers of the section ``motors``."""
     radius_m, n = robot.wheel_radius_m, len(robot.logged_wheels)
     torque_nm = robot.mass_kg * GRAVITY_MPS2 * radius_m / n
+    if robot.skids:
+        torque_nm *= 1.0 + robot.wheelbase_m / robot.track_m
     speed_mps = math.sqrt(FROUDE * GRAVITY_MPS2 * robot.wheelbase_m)
     speed_radps = getattr(robot, "speed_max_mps", speed_mps) / radius_m
     supply_v = 24.0 if robot.mass_kg < HEAVY_KG else 48.0
-    gain = BANDWIDTH_RADPS * (robot.body.wheel_inertia_kgm2 + robot.mass_kg / n * radius_m**2)
+    gain = min(2.0 * torque_nm / speed_radps, FREE_RADPS * robot.body.wheel_inertia_kgm2)
     return {
         "reduction_ratio": MOTOR_RADPS / speed_radps,
         "torque_constant_nmpa": supply_v / (NO_LOAD_RATIO * MOTOR_RADPS),
