@@ -79,9 +79,9 @@ class TractionSettings(NamedTuple):
 
 
 SETTINGS = TractionSettings()
-#: Of other than swerve robots: a satellite receiver or a camera gives a speed to 2 or 3 cm/s, which near the launch
-#: speed is 0.08 of slip, and a fifth of what a start takes without control; their filter knows a speed from less on.
-OTHERS_STD_MAX_RATIO, OTHERS_LAUNCH_MPS = 0.08, 0.15
+#: Of other than swerve robots: a satellite receiver or a camera gives a speed to 3 or 4 cm/s, which near the launch
+#: speed is 0.2 of slip, and less than half of what a start takes without control; their filter knows slower speeds.
+OTHERS_STD_MAX_RATIO, OTHERS_LAUNCH_MPS = 0.2, 0.15
 
 
 class TractionTarget(NamedTuple):
@@ -127,7 +127,7 @@ def settings_of(robot: Robot) -> TractionSettings:
             droop_radps_per_nm=0.0,
             std_max_ratio=OTHERS_STD_MAX_RATIO,
             launch_mps=OTHERS_LAUNCH_MPS,
-            std_ahead=0.5,
+            std_ahead=0.25,
         )
     motors, torque = robot.completed.motors, robot.mass_kg * robot.wheel_radius_m / len(robot.logged_wheels)
     if motors.speed_gain_nmspr == 0.0:
