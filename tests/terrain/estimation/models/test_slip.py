@@ -169,7 +169,7 @@ def test_spinning_wheels_show_no_heading_and_slip_that_is_seen_is_one():
 # -- what is not observed --------------------------------------------------------------------------------------------
 
 
-def test_without_a_reference_slip_is_unknown_and_the_reason_is_said():
+def test_without_a_reference_slip_is_unknown_and_the_reason_is_stated():
     time_s, rows, _ = drive(HUSKY, n=300)
     blind = {name: row for name, row in rows.items() if not name.startswith("gnss")}
     filter_, track = run_filter(HUSKY, time_s, blind)
