@@ -19,6 +19,7 @@ from terrain.slip_learning.measured import (
     spinning_wheels,
     surface_slips,
     travelled,
+    wheel_speeds,
     window_rates,
 )
 from terrain.slip_learning.sessions import IntervalOf
@@ -200,3 +201,25 @@ def test_round_off_of_a_straight_drive_fits_nothing():
     straight, rounded = wheels * [1.0, 0.0, 0.0], wheels * [1.0, 0.0, 1e-17]
     assert _misfit(rounded, outside) == _misfit(straight, outside)
     assert _misfit(wheels, outside) < _misfit(straight, outside)
+
+
+@pytest.mark.parametrize("name", ["adap2e", "pallet_truck"])
+def test_the_wheel_of_a_car_that_is_not_driven_rolls_with_the_other_and_has_no_slip(name):
+    """Straight at 0.9 m/s over ground, driven at 1 m/s, and steered by 0.3 rad: the speeds of one rigid motion."""
+    robot, time_s = load_robot(name), np.arange(0.0, 12.0, 0.02)
+    (driven,) = robot.logged_wheels
+    for steer_rad in (0.0, 0.3):
+        streams = {
+            "wheels": Stream(time_s, np.ones((time_s.size, 1)), robot.rate_channels),
+            "steering": Stream(time_s, np.full((time_s.size, 1), steer_rad), robot.steer_channels),
+            "odometry": Stream(time_s, np.tile([0.9, 0.0], (time_s.size, 1)), ("speed_x_mps", "speed_y_mps")),
+        }
+        _, speeds = wheel_speeds(RunLog("r", name, streams), robot)
+        assert speeds[0, robot.wheels.index(driven)] == 1.0
+        assert speeds[0, 0] * np.cos(steer_rad) == pytest.approx(speeds[0, 1])
+        if steer_rad == 0.0:
+            found = measured_slip(RunLog("r", name, streams), robot)
+            assert found.body_slip == pytest.approx(0.1, abs=1e-6)
+            is_driven = np.isin(robot.wheels, robot.logged_wheels)
+            assert found.slip_ratio[:, is_driven] == pytest.approx(0.1, abs=1e-6)
+            assert np.isnan(found.slip_ratio[:, ~is_driven]).all()
