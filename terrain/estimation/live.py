@@ -643,7 +643,7 @@ Estimator = LiveFilter | LiveObserver
 #: Filters and observers that run sample by sample, by drive, without a file of their own; the first is used where
 #: none is named.
 LIVE_FILTERS: Mapping[str, tuple[str, ...]] = {
-    "swerve": ("vio15", "vio12", "encoder12"),
+    "swerve": ("vio15", "vio12", "encoder12", "slip"),
     "skid_steer": ("skid", "slip"),
     "tracked": ("skid", "slip", "tracked", "slip-learning", "gyrodometry", "encoder-odometry"),
     "bicycle": ("sideslip-multi", "sideslip-dynamic", "sideslip-kinematic", "slip"),

@@ -16,6 +16,7 @@ from pipelines.cli.table import Command  # noqa: E402
 from terrain.errors import TerrainError  # noqa: E402
 
 STUDIES = {
+    "slip": "slip of robots of every drive by what measures their motion, and ten seconds without",
     "consistency": "NEES and coverage of slip by terrain, over simulated runs",
     "long-drives": "yaw of a filter on long drives, and after the loss of the camera",
     "intervals": "coverage of the intervals of all that is identified",

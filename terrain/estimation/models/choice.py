@@ -26,7 +26,7 @@ def _sideslip(name: str, robot: BicycleRobot, _: SlipModel) -> Observer:
 _SLIP: Mapping[str, Callable[[Any, SlipModel], Observer]] = {"slip": lambda robot, _: SlipFilter(robot)}
 
 OBSERVERS_OF_DRIVE: Mapping[str, Mapping[str, Callable[[Any, SlipModel], Observer]]] = {
-    **dict.fromkeys(("skid_steer", "omni", "mecanum", "tricycle"), _SLIP),
+    **dict.fromkeys(("swerve", "skid_steer", "omni", "mecanum", "tricycle"), _SLIP),
     "tracked": {
         **_SLIP,
         "tracked": lambda robot, _: TrackedObserver(robot),
@@ -54,8 +54,8 @@ REFERENCES = ("gnss", "pose", "lidar", "odometry")
 def suitable_filter(robot: Robot, streams: Container[str]) -> str:
     """Return the filter or observer that makes most of what a log or a robot measures.
 
-    Of swerve robots that with a camera, or without; of others ``slip`` where anything measures the motion over ground,
-    and where nothing does ``skid`` of robots that skid, as slip is not observable then.
+    Of swerve robots with a camera ``vio15``; of all others ``slip`` where anything measures the motion over ground, and
+    where nothing does ``skid`` of robots that skid and ``encoder12`` of swerve robots, as slip is not observable then.
 
     Parameters
     ----------
@@ -69,12 +69,12 @@ def suitable_filter(robot: Robot, streams: Container[str]) -> str:
     >>> suitable_filter(husky, ("wheels", "imu")), suitable_filter(husky, ("wheels", "imu", "gnss"))
     ('skid', 'slip')
     """
-    if robot.drive == "swerve":
-        name = "vio15" if "odometry" in streams and robot.describes("camera") else "encoder12"
-    elif robot.skids and not any(stream in streams for stream in REFERENCES):
-        name = "skid"
-    else:
+    if robot.drive == "swerve" and "odometry" in streams and robot.describes("camera"):
+        name = "vio15"
+    elif any(stream in streams for stream in REFERENCES):
         name = "slip"
+    else:
+        name = {"swerve": "encoder12"}.get(robot.drive, "skid" if robot.skids else "slip")
     return robot.filters[0] if robot.filters and name not in robot.filters else name
 
 

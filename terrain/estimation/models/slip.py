@@ -73,7 +73,7 @@ weight in traction, adds; and what turning on the spot does."""
 YIELDING_RATIO = 0.3
 """Length over the radius of a wheel that it rolls from rest until the contact pulls: tyre and soil yield first, a track
 and a gear have slack; d is then of the order of 1."""
-SLOW_RATIO, SLOW_WALK = 0.2, 0.03
+SLOW_RATIO, SLOW_WALK = 0.2, 0.02
 """Of m at first, about 0, and its walk within a second of driving."""
 TURN_WALK, DIRECTION_RATIO = 0.02, 0.1
 """Walk of chi within a second of turning, and deviation of m where the wheels begin to turn otherwise, in reverse or
@@ -85,7 +85,7 @@ ACROSS_RATIO, ACROSS_M = 0.03, 0.05
 WHEEL_STD_MPS, GYRO_STD_RADPS, YAW_ACCEL = 0.01, 0.005, 1.0
 """Of a wheel's speed and a gyro's rate; walk of the yaw rate within a second."""
 BIAS_STD_RADPS, BIAS_WALK = 0.005, 2e-4
-ACCEL_WALK, SHAKEN_RATIO, FREE_WALK = 0.05, 0.4, 1.0
+ACCEL_WALK, SHAKEN_RATIO, FREE_WALK = 0.05, 0.2, 1.0
 """Walk of the speed within a second beside an accelerometer, what 1 m/s^2 of vibration adds, and without one."""
 TILTED_STD, TILTED_WALK, UNTILTED_STD, UNTILTED_WALK = 0.15, 0.1, 0.6, 0.3
 """Of the accelerometer's bias with a measured pitch, and without one, where it is the slope's gravity."""
@@ -336,6 +336,7 @@ class SlipFilter(FilterObserver):
             inputs=_INPUTS,
             references=("pose", "gnss_position", "gnss_speed", "camera"),
             positions=_MOTION[:2],
+            integrals=(("yaw_rad", "yaw_rate_radps"),),
             angle_states=("yaw_rad",),
             angle_rows=("pose_yaw_rad", "compass_rad"),
         )
