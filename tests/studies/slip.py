@@ -224,6 +224,6 @@ def report(result: SlipResult) -> Report:
     worst = max((row.rmse for row in result.figures), default=math.nan)
     return Report(
         "Slip of robots of every drive",
-        f"Slip of {len(result.figures)} pairs of robot and sensors has an RMSE of {format_value(worst, '.3f')} at most.",
+        f"Slip of {len(result.figures)} robots and sensors has an RMSE of at most {format_value(worst, '.3f')}.",
         parts=(Table(columns, cells, title="Errors of slip, and coverage of its 95 % intervals"),),
     )

@@ -111,8 +111,9 @@ PREDICTED_S = 0.5
 """Time without a reference from which on slip is predicted."""
 UNKNOWN_RATIO = 0.25
 """Standard deviation of a slip that is not known."""
-LEAST_MPS, STANDING_MPS, VIBRATION_S, CHANGE_S = 0.2, 0.01, 0.3, 0.15
-"""Least speed that shows a heading, that of wheels that stand; low-passes of vibration and of the wheels' speeds."""
+LEAST_MPS, STANDING_MPS, VIBRATION_S, CHANGE_S, MEAN_S = 0.2, 0.01, 0.3, 0.15, 0.4
+"""Least speed that shows a heading, that of wheels that stand; low-passes of vibration, of how the wheels' speeds
+change, and of what their slip is multiplied by."""
 N_JUDGED = 7
 """Sensors beside the wheels, which are rejected where the ground or a sensor is to blame."""
 MOST_MPS, MOST_RADPS, MOST_MPS2 = 60.0, 30.0, 100.0
@@ -127,12 +128,14 @@ MOST_ROWS = 6  # of a swerve robot: along and across each wheel
 # Places in `params`: counts and levers, the slow state of each row; and as inputs D, u, t, U, the acceleration, ages.
 _N_ROWS, _N_SLOW, _TURNS, _FREE_ACROSS, _ANTENNA, _POSED, _SEEN, _GROUP = 0, 1, 2, 3, 4, 6, 8, 10
 _D = _GROUP + MOST_ROWS
-_U, _T, _SIZE = _D + 3 * MOST_ROWS, _D + 4 * MOST_ROWS, _D + 5 * MOST_ROWS
+_U, _S, _T, _SIZE = (_D + k * MOST_ROWS for k in (3, 4, 5, 6))
 _ACCEL, _MEAN_ACCEL, _AGES = _SIZE + 1, _SIZE + 2, _SIZE + 3
-_SPEEDS, _TURNING = slice(_U - _D, _T - _D), slice(_T - _D, _SIZE - _D)  # among the inputs
+_SPEEDS, _SMOOTH, _TURNING = (
+    slice(a - _D, b - _D) for a, b in ((_U, _S), (_S, _T), (_T, _SIZE))
+)  # of the inputs
 _INPUTS = (
     *(f"d_{i}" for i in range(3 * MOST_ROWS)),
-    *(f"{name}_{i}" for name in "ut" for i in range(MOST_ROWS)),
+    *(f"{name}_{i}" for name in "ust" for i in range(MOST_ROWS)),
     *("size", "accel", "mean_accel", "gnss_age", "pose_age", "camera_age"),
 )
 
@@ -176,7 +179,7 @@ def _wheels(x: Array, params: Array, z: Array) -> None:
     for i in range(int(params[_N_ROWS])):
         d = _D + 3 * i
         ground = params[d] * x[_VX] + params[d + 1] * x[_VY] + params[d + 2] * x[_W]
-        z[i] = ground - params[_U + i] * (1.0 - x[_SLOW + int(params[_GROUP + i])])
+        z[i] = ground - params[_U + i] + params[_S + i] * x[_SLOW + int(params[_GROUP + i])]
         if turns > 0:
             z[i] += params[_T + i] * x[_SLOW + n_slow]
         z[i] += params[_SIZE] * x[_SLOW + n_slow + turns + i]
@@ -345,6 +348,7 @@ class SlipFilter(FilterObserver):
         self._rolling, self._steer = rolling_matrix(*place)[logged], steer
         self._smooth_mps, self._accel_mps2, self._shaken_square = np.full(len(logged), np.nan), math.nan, 0.0
         self._pulls, self._accel_is_wrong, self._rolled_m = np.zeros(len(logged)), False, 0.0
+        self._mean_mps = np.full(len(logged), np.nan)
         self._has_delay, self._uphill, self._asked = False, 0.0, 0.0
         bounds = [DELAY_BOUNDS_S, *[SLIP_BOUNDS] * (n_slow + turns + n_rows)]
         self._bounds = np.array(bounds)
@@ -361,13 +365,18 @@ class SlipFilter(FilterObserver):
         dt_s = dt_s if 0.0 <= dt_s < math.inf else 0.0
         speeds = np.array([given[name] for name in self._speeds])
         speeds[~(np.abs(speeds) <= MOST_MPS)] = np.nan
+        before_mps = np.where(np.isfinite(self._mean_mps), self._mean_mps, np.nan_to_num(speeds))
+        gain = -math.expm1(-dt_s / MEAN_S)
+        self._mean_mps = before_mps + gain * np.nan_to_num(speeds - before_mps)
         rates_mps2 = self._rates(speeds, dt_s)
         angles = np.array([given[name] for name in self._steer])
-        inputs = self._inputs(given, speeds, angles, dt_s)
+        inputs = self._inputs(given, speeds, before_mps, angles, dt_s)
         z, logged, across = np.full(MOST_ROWS, np.nan), *self._wheels[:2]
         z[: logged.size] = np.where(np.isin(logged, across[np.isnan(angles)]), np.nan, 0.0 * speeds)
         if np.isfinite(speeds).any():
             z[logged.size : logged.size + across.size] = 0.0 * angles
+        if isinstance(self._robot, BicycleRobot):
+            z[logged.size] += math.sin(float(np.nan_to_num(angles[0]))) * float(self.filter.mean[_VX])
         gyro = given["yaw_rate_radps"]
         references = self._place(given, inputs)
         z = np.concatenate([z, [gyro if abs(gyro) <= MOST_RADPS else np.nan], references])
@@ -398,8 +407,14 @@ class SlipFilter(FilterObserver):
         self._smooth_mps = np.where(np.isfinite(speeds), moved, self._smooth_mps)
         return np.asarray(behind / CHANGE_S)
 
-    def _inputs(self, given: Mapping[str, float], speeds: Array, angles: Array, dt_s: float) -> Array:
-        """Return the inputs of a tick; a steered wheel's direction is that of its angle."""
+    def _inputs(
+        self, given: Mapping[str, float], speeds: Array, before_mps: Array, angles: Array, dt_s: float
+    ) -> Array:
+        """Return the inputs of a tick; a steered wheel's direction is that of its angle.
+
+        What m and chi are multiplied by are the low-passed speeds of before: by those of the tick, whose ripple the
+        body does not follow, m would grow by its covariance with the innovation, the ratio of an error in variables.
+        """
         n, inputs, (logged, across, _) = speeds.size, np.zeros(len(_INPUTS)), self._wheels
         known, rolling, turning = np.nan_to_num(speeds), np.zeros((MOST_ROWS, 3)), np.zeros(MOST_ROWS)
         rolling[:n] = self._rolling
@@ -412,9 +427,10 @@ class SlipFilter(FilterObserver):
             rolling[:n] = rolling_matrix(positions_m, directions)[logged]
             rolling[n : n + across.size] = rolling_matrix(positions_m, directions + 0.5 * math.pi)[across]
         if self._robot.skids:
-            turning[:2] = np.array([-0.5, 0.5]) * (known[1] - known[0])
+            turning[:2] = np.array([-0.5, 0.5]) * (before_mps[1] - before_mps[0])
         elif isinstance(self._robot, BicycleRobot):
-            turning[n] = rolling[0, 0] * known[0] * math.sin(float(directions[0]))
+            # what it drives ahead is given, not inferred: by a small turn a steering that is off would be a speed
+            turning[n], rolling[n, 0] = rolling[0, 0] * before_mps[0] * math.sin(float(directions[0])), 0.0
         accel = given["accel_x_mps2"]
         if math.isfinite(given["pitch_rad"]):  # the specific force at rest is -g sin(pitch)
             accel += GRAVITY_MPS2 * math.sin(given["pitch_rad"])
@@ -425,9 +441,10 @@ class SlipFilter(FilterObserver):
             gain, apart = -math.expm1(-dt_s / VIBRATION_S), accel - self._accel_mps2
             self._accel_mps2 += gain * apart
             self._shaken_square += gain * (apart * apart - self._shaken_square)
-        size = math.sqrt(float(np.mean(known**2)))
+        size = math.sqrt(max(float(np.mean(known**2)), float(np.mean(before_mps**2))))
         ages = [given[name] if 0.0 <= given[name] <= OLDEST_S else 0.0 for name in _AGE_ROWS]
         inputs[: 3 * MOST_ROWS], inputs[_SPEEDS][:n], inputs[_TURNING] = rolling.ravel(), known, turning
+        inputs[_SMOOTH][:n] = before_mps
         inputs[_SIZE - _D :] = size, accel, self._accel_mps2, *ages
         self.accel_mps2 = accel - float(self.filter.mean[_ACCEL_BIAS])
         return inputs
