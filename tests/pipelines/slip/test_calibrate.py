@@ -10,6 +10,7 @@ from pipelines.slip.calibrate import Settings, run
 from terrain.errors import DataError
 from terrain.estimation.feed import measurement_table
 from terrain.logs.run_folders import write_run
+from terrain.records import Stream
 from terrain.robots import description_file, load_robot
 from terrain.simulation.run import six_positions_log
 
@@ -186,3 +187,19 @@ def test_runs_that_show_nothing_or_are_of_another_robot_are_one_sentence(four_nu
     other.write_text(FOUR_NUMBERS.replace("name: husky", "name: mine"), encoding="utf-8")
     with pytest.raises(DataError, match="is one of robot 'husky', and 'mine' is calibrated"):
         calibrate(write_rtk(tmp_path / "runs", n=1), str(other))
+
+
+def test_standing_alone_shows_noise_and_bias_and_stops_nothing(four_numbers, tmp_path):
+    for k in range(3):
+        each, _ = rtk_run(k)
+        streams = {
+            name: Stream(s.time_s[s.time_s < 8.0], s.values[s.time_s < 8.0], s.channels)
+            for name, s in each.streams.items()
+        }
+        write_run(replace(each, streams=streams, labels=()), tmp_path / "runs")
+    result = calibrate(tmp_path / "runs", str(four_numbers))
+    found = {finding.parameter: finding for finding in result.findings}
+    for name in ("sensors.gyro_bias_z_radps", "sensors.gyro_std_radps", "identified.imu_pitch_rad"):
+        assert found[name].determined, name
+    assert not found["identified.rolling_radius_m"].determined
+    assert found["identified.rolling_radius_m"].note
