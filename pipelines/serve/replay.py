@@ -18,6 +18,7 @@ from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.settings import ReadSettings
 from pipelines.live.chain import Chain
 from pipelines.live.model import TerrainModel
+from pipelines.live.pilot import LivePilot
 from pipelines.live.session import chain_of
 from pipelines.live.windows import needs_filter
 from pipelines.report.figure import Figure, Line, Panel, Strip
@@ -32,6 +33,7 @@ from terrain.discrepancy.watch import BLOCK_S, WORDS, Alarm, Watch, clock_text, 
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live import CHANNELS
 from terrain.files.names import printable
+from terrain.kinematics.logged_wheels import with_desired_twist
 from terrain.logs.replay import SENSORS, replay
 from terrain.records import RunLog
 from terrain.robots import Robot, load_robot, robot_named
@@ -179,6 +181,8 @@ def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
     with stopping(stop.set):
         for each in logs:
             chain = chain_of_run(each, model, table, robot, watch is not None)
+            if isinstance(chain, LivePilot):
+                each = with_desired_twist(each, robot_named(each.robot, robot))
             runs.append(replay_run(each, chain, settings, progress, stop, watch, blocks))
             if runs[-1].interrupted:
                 break

@@ -235,7 +235,9 @@ def fit_ground(
         for i, column in enumerate(columns):
             left[~kept, column] = mean_response[~kept, column] - process.predict(mean_regime[~kept, i], i)
     within = responses - mean_response[unit]
-    floor = np.diag((FLOOR * np.maximum(responses.std(axis=0), 1e-12)) ** 2)
+    # the responses of a single unit have no spread, and their differences have rank 1
+    spread = np.maximum(responses.std(axis=0), FLOOR * np.abs(responses).max(axis=0))
+    floor = np.diag((FLOOR * np.maximum(spread, 1e-12)) ** 2)
     covariance = left.T @ left / len(left) + within.T @ within / max(len(within) - len(left), 1) + floor
     ground = GroundResponse(tuple(processes), n_wheels, n_quantities, covariance)
     return ground, (mean_response - left)[unit]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.kinematics.wheels import wheel_frame_velocities
+from terrain.kinematics.wheels import rolled_twist, wheel_frame_velocities
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, TWIST
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
@@ -59,6 +59,30 @@ def with_wheel_speeds(run: RunLog, robot: Robot) -> RunLog:
     channels, compute = found
     speeds = Stream(wheels.time_s, compute(wheels.values), channels)
     return replace(run, streams=dict(run.streams) | {"wheels": speeds})
+
+
+def with_desired_twist(run: RunLog, robot: Robot) -> RunLog:
+    """Return a run whose stream ``commands`` has a twist: that of its commanded wheel rates, rolling without slip.
+
+    A run that has one, or without commanded rates of all wheels, comes back as it is, as does one of a robot that
+    steers its wheels.
+
+    Examples
+    --------
+    >>> rates = Stream(np.arange(2.0), np.full((2, 2), 10.0), ["wheel_left_radps", "wheel_right_radps"])
+    >>> run = with_desired_twist(RunLog("a", "husky", {"commands": rates}), load_robot("husky"))
+    >>> run.streams["commands"].columns(TWIST)[0].round(3)
+    array([1.651, 0.   , 0.   ])
+    """
+    commands, rates = run.streams.get("commands"), [f"wheel_{wheel}_radps" for wheel in robot.wheels]
+    if commands is None or robot.steered_wheels or not set(rates) <= set(commands.channels):
+        return run
+    if set(TWIST) & set(commands.channels):
+        return run
+    speeds = robot.wheel_radius_m * commands.columns(rates)
+    twist = rolled_twist(robot, speeds, np.zeros_like(speeds))
+    desired = Stream(commands.time_s, np.hstack([commands.values, twist]), (*commands.channels, *TWIST))
+    return replace(run, streams=dict(run.streams) | {"commands": desired})
 
 
 def wheel_speeds_from(

@@ -33,8 +33,8 @@ def replay(run: RunLog, rate_hz: float = 50.0) -> Iterator[Sample]:
 
     Without wheels the first stamp of any sensor is taken.  A sample has the readings stamped after the step before and
     up to this one, in the order of the log, and all channels of it, which they name; the last twist desired by then,
-    zeros where the log has none; the label there.  A stamp is taken for the instant at which a sample came.  One that
-    is out of order, or no number, came with the next one in order.
+    zeros for what of it the log does not have; the label there.  A stamp is taken for the instant at which a sample
+    came.  One that is out of order, or no number, came with the next one in order.
 
     Raises
     ------
@@ -80,10 +80,11 @@ def _steps(run: RunLog, came: dict[str, Array], step_s: float) -> Iterator[Sampl
     ticks = start_s + step_s * np.arange(np.ceil((end_s - start_s - _SLACK_S) / step_s) + 1)
     ends = {name: np.searchsorted(c, ticks + _SLACK_S, side="right") for name, c in came.items()}
     twists, commands = np.zeros((ticks.size, 3)), run.streams.get("commands")
-    if commands is not None and set(TWIST) <= set(commands.channels):
-        desired = commands.columns(TWIST)
+    if commands is not None and len(commands):
         last = np.searchsorted(commands.time_s, ticks + _SLACK_S, side="right") - 1
-        twists[last >= 0] = desired[last[last >= 0]]
+        for i, name in enumerate(TWIST):
+            if name in commands.channels:  # commands of robots that cannot drive sideways have two
+                twists[last >= 0, i] = commands.channel(name)[last[last >= 0]]
     channels = {name: run.streams[name].channels for name in came}
     for k, tick_s in enumerate(ticks.tolist()):
         readings = {}

@@ -33,6 +33,7 @@ from terrain.identify import deal, folds
 from terrain.records import Array
 
 TAIL = 0.025  #: Probability on each side of an interval
+MIN_RUNS = 3  #: Fewer runs on a terrain do not show how runs differ: it is not learned
 
 _BISECTIONS = 40
 
@@ -70,13 +71,13 @@ class SlipRegressor(RegressorMixin, BaseEstimator):
         ----------
         X : (n, columns) wheel speeds and responses, NaN where missing
         y : (n,) measured slip; windows where it is NaN are not used
-        terrain : (n,) names; without any, all windows are of one
+        terrain : (n,) names; without any, all windows are of one; of fewer than :data:`MIN_RUNS` runs it is not learned
         groups : (n,) run of each window
 
         Raises
         ------
         DataError
-            if no window has a slip and all its responses.
+            if no window has a slip and all its responses, or no terrain has enough runs.
         """
         terrain = np.full(len(y), "") if terrain is None else np.asarray(terrain).astype(str)
         groups = np.arange(len(y)) if groups is None else np.asarray(groups)
@@ -85,6 +86,12 @@ class SlipRegressor(RegressorMixin, BaseEstimator):
         usable &= np.linalg.norm(np.nan_to_num(X[:, :n_wheels]), axis=1) > 0.0
         if not usable.any():
             raise DataError("no window has a measured slip beside all its wheel speeds and responses")
+        names = np.unique(np.column_stack([terrain, groups.astype(str)])[usable], axis=0)[:, 0]
+        usable &= np.isin(terrain, [name for name in set(names) if (names == name).sum() >= MIN_RUNS])
+        if not usable.any():
+            raise DataError(
+                f"no terrain has {MIN_RUNS} runs with a slip in steady motion, the least that show how runs differ"
+            )
         X, y, terrain, groups = X[usable], y[usable], terrain[usable], groups[usable]
         self.terrains_, self.classifier_ = np.unique(terrain), None
         self.fastest_mps_ = float(np.linalg.norm(X[:, :n_wheels], axis=1).max())

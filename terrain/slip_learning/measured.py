@@ -403,8 +403,9 @@ def measured_slip(
     across = ahead[:, 0] * twist[:, 1] - ahead[:, 1] * twist[:, 0]
     side = np.where(np.isnan(body_slip), np.nan, across / np.maximum(speed, np.abs(body)))
     middle_s = (start_s + end_s) / 2
-    first, first_std = window_rates(*rolled, start_s, middle_s, *enough)
-    second, second_std = window_rates(*rolled, middle_s, end_s, *enough)
+    half = (STREAM_SAMPLES, enough[1])  # of a short window at 20 Hz it has five samples
+    first, first_std = window_rates(*rolled, start_s, middle_s, *half)
+    second, second_std = window_rates(*rolled, middle_s, end_s, *half)
     least = STEADY_RATIO * np.abs(u).max(axis=1, keepdims=True)
     allowed = np.maximum(least, STEADY_STD * np.hypot(first_std, second_std))
     return MeasuredSlip(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from sklearn.base import clone
 
-from terrain.classify.response import GroupedResponse, ResponseColumns, fit_process, left_out
+from terrain.classify.response import GroupedResponse, ResponseColumns, fit_ground, fit_process, left_out
 from terrain.errors import DataError
 
 WHEELS = np.radians([150.0, 270.0, 390.0])
@@ -106,3 +106,10 @@ def test_data_that_cannot_answer_are_refused():
     X[y == "carpet", 4] = np.nan
     with pytest.raises(DataError, match="no window of class 'carpet'"):
         GroupedResponse(COLUMNS).fit(X, y, groups=groups)
+
+
+def test_a_ground_of_a_single_window_has_a_covariance_that_can_be_used():
+    """Differences of a single unit have rank 1."""
+    regime = np.array([[[0.6, 0.8, 0.5], [0.8, 0.6, 0.5]]])
+    ground, _ = fit_ground(regime, np.array([[-4.1, 30.5, 0.03]]), np.array(["a"]), n_body=1)
+    assert np.isfinite(np.linalg.cholesky(ground.covariance)).all()

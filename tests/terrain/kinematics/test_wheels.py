@@ -20,7 +20,7 @@ from terrain.kinematics.commands import (
     wheel_commands,
     wheel_motion,
 )
-from terrain.kinematics.logged_wheels import true_slip, wheel_and_ground_speed
+from terrain.kinematics.logged_wheels import true_slip, wheel_and_ground_speed, with_desired_twist
 from terrain.kinematics.wheels import (
     in_wheel_frame,
     no_slip_twist,
@@ -29,7 +29,7 @@ from terrain.kinematics.wheels import (
     velocity_matrix,
     wheel_frame_velocities,
 )
-from terrain.records import Stream
+from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 
@@ -252,3 +252,16 @@ def test_the_sign_of_a_simulated_slip_is_that_of_traction_in_both_directions():
     np.testing.assert_array_equal(slip[clear] > 0.0, ((wheel_speed - ground) * np.sign(ground) > 0.0)[clear])
     rates = Stream(np.arange(2.0), np.zeros((2, 3)), [f"wheel_{i}_radps" for i in (1, 2, 3)])
     assert np.isnan(true_slip(rates, ROBOT.wheels)).all()  # never defined
+
+
+@pytest.mark.parametrize("robot", [HUSKY, ROBOTINO, load_robot("marmotte"), load_robot("omnirobot")])
+def test_a_log_of_commanded_wheels_says_what_twist_was_desired(robot):
+    twist = np.array([[0.2, 0.0, 0.0], [-0.1, 0.05 * robot.sideways, 0.3]])
+    names = [f"wheel_{wheel}_radps" for wheel in robot.wheels]
+    commands = Stream([0.0, 1.0], wheel_motion(robot, twist, 0.02).wheel_radps, names)
+    run = RunLog("a", robot.name, {"commands": commands})
+    found = with_desired_twist(run, robot)
+    given = found.streams["commands"].columns(("speed_x_mps", "speed_y_mps", "yaw_rate_radps"))
+    np.testing.assert_allclose(given, twist, atol=1e-12)
+    assert with_desired_twist(found, robot) is found
+    assert with_desired_twist(run, ROBOT) is run

@@ -66,3 +66,8 @@ def test_what_cannot_be_replayed_is_refused():
     ):
         with pytest.raises(error, match=sentence):
             replay(run, *options)
+
+
+def test_what_a_log_has_of_the_desired_twist_is_given():
+    run = run_of(imu=imu([0.0, 0.02]), commands=([0.0], [[0.5, 0.2]], ("speed_x_mps", "yaw_rate_radps")))
+    assert [sample.twist.tolist() for sample in replay(run)] == [[0.5, 0.0, 0.2]] * 2

@@ -80,3 +80,13 @@ def test_the_interval_of_an_error_is_over_sessions_where_there_are_several():
     low, high = interval(run // 10)
     assert high - low > 3.0 * np.ptp(interval(np.zeros(120)))
     assert (low, high > 0.05) == (0.0, True)  # by Student's t of three, which none of them bounds
+
+
+def test_a_terrain_of_fewer_runs_than_show_how_runs_differ_is_not_learned():
+    X, slip, terrain, groups = data_of(np.random.default_rng(3), 40)
+    rare = np.array(terrain)
+    rare[groups == groups[-1]] = "sand"  # one run
+    assert SlipRegressor(COLUMNS).fit(X, slip, rare, groups).terrains_.tolist() == ["cork", "moss"]
+    few = np.isin(groups, np.unique(groups)[:2])
+    with pytest.raises(DataError, match="no terrain has 3 runs"):
+        SlipRegressor(COLUMNS).fit(X[few], slip[few], terrain[few], groups[few])

@@ -223,3 +223,19 @@ def test_the_wheel_of_a_car_that_is_not_driven_rolls_with_the_other_and_has_no_s
             is_driven = np.isin(robot.wheels, robot.logged_wheels)
             assert found.slip_ratio[:, is_driven] == pytest.approx(0.1, abs=1e-6)
             assert np.isnan(found.slip_ratio[:, ~is_driven]).all()
+
+
+def test_short_windows_at_20_hz_are_judged_steady_by_their_halves():
+    """The halves of half a second have five samples: steady driving is steady there, a change of speed is not."""
+    time_s = np.arange(120) / 20.0
+    speed = np.where(time_s < 3.0, 0.5, 1.0)
+    wheels = Stream(time_s, np.column_stack([speed, speed]), ("speed_left_mps", "speed_right_mps"))
+    twist = np.column_stack([0.9 * speed, 0.0 * speed, 0.0 * speed])
+    lidar = Stream(time_s, twist, ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"))
+    found = measured_slip(
+        RunLog("a", "husky", {"wheels": wheels, "lidar": lidar}), HUSKY, window_s=0.5, stride_s=0.25
+    )
+    across = (found.start_s < 2.95) & (found.end_s > 3.05)
+    assert found.steady[~across].all()
+    assert not found.steady[across & (np.abs(found.time_s - 3.0) < 0.1)].any()
+    np.testing.assert_allclose(found.body_slip[~across], 0.1, atol=1e-9)
