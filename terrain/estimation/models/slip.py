@@ -43,7 +43,7 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -121,9 +121,9 @@ MOST_MPS, MOST_RADPS, MOST_MPS2 = 60.0, 30.0, 100.0
 
 _MOTION = (
     *("position_x_m", "position_y_m", "yaw_rad", "speed_x_mps", "speed_y_mps", "yaw_rate_radps"),
-    *("gyro_bias_radps", "accel_bias_x_mps2", "fix_delay_s"),
+    *("gyro_bias_radps", "accel_bias_x_mps2", "gnss_delay_s", "pose_delay_s"),
 )
-_X, _Y, _YAW, _VX, _VY, _W, _GYRO_BIAS, _ACCEL_BIAS, _DELAY, _SLOW = range(10)
+_X, _Y, _YAW, _VX, _VY, _W, _GYRO_BIAS, _ACCEL_BIAS, _GNSS_DELAY, _POSE_DELAY, _SLOW = range(11)
 MOST_ROWS = 6  # of a swerve robot: along and across each wheel
 # Places in `params`: counts and levers, the slow state of each row; and as inputs D, u, t, U, the acceleration, ages.
 _N_ROWS, _N_SLOW, _TURNS, _FREE_ACROSS, _ANTENNA, _POSED, _SEEN, _GROUP = 0, 1, 2, 3, 4, 6, 8, 10
@@ -143,7 +143,11 @@ _REFERENCES = (
     *("gnss_x_m", "gnss_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps"),
     *("pose_x_m", "pose_y_m", "pose_yaw_rad", "compass_rad", "camera_x_mps", "camera_y_mps"),
 )
-_DELAYS = {0: ("gnss_delay_s",), 4: ("pose_delay_s", "lidar_delay_s"), 8: ("lidar_delay_s",)}
+_DELAYS: dict[int, tuple[Any, ...]] = {  # state and names in a description, by the row that begins to measure
+    0: (_GNSS_DELAY, "gnss_delay_s"),
+    4: (_POSE_DELAY, "pose_delay_s", "lidar_delay_s"),
+    8: (_POSE_DELAY, "lidar_delay_s"),
+}
 _AGE_ROWS = ("gnss_age_s", "pose_age_s", "camera_age_s")
 _INERTIAL = ("yaw_rate_radps", "accel_x_mps2", "pitch_rad")
 
@@ -188,7 +192,7 @@ def _wheels(x: Array, params: Array, z: Array) -> None:
 @njit
 def _placed(x: Array, sensor: int, lever_x: float, lever_y: float, params: Array, z: Array) -> None:
     """Write position and velocity in the world of a point of the body, an age ago."""
-    age, accel = params[_AGES + sensor] + x[_DELAY], params[_MEAN_ACCEL]
+    age, accel = params[_AGES + sensor] + x[_GNSS_DELAY + min(sensor, 1)], params[_MEAN_ACCEL]
     accel = accel - x[_ACCEL_BIAS] if math.isfinite(accel) else 0.0
     along, across = x[_VX] - age * (accel + x[_W] * x[_VY]), x[_VY]
     middle, then = x[_YAW] - 0.5 * age * x[_W], x[_YAW] - age * x[_W]
@@ -211,12 +215,12 @@ def _measure(x: Array, _dt: float, params: Array, z: Array) -> None:
     pose = np.zeros(4)
     _placed(x, 1, params[_POSED], params[_POSED + 1], params, pose)
     fix = z[MOST_ROWS + 5 :]
-    fix[0], fix[1], fix[2] = pose[0], pose[1], x[_YAW] - (params[_AGES + 1] + x[_DELAY]) * x[_W]
+    fix[0], fix[1], fix[2] = pose[0], pose[1], x[_YAW] - (params[_AGES + 1] + x[_POSE_DELAY]) * x[_W]
     fix[3] = x[_YAW]
     fix[4] = x[_VX] - x[_W] * params[_SEEN + 1]
     fix[5] = x[_VY] + x[_W] * params[_SEEN]
     if math.isfinite(params[_MEAN_ACCEL]):
-        fix[4] -= (params[_AGES + 2] + x[_DELAY]) * (params[_MEAN_ACCEL] - x[_ACCEL_BIAS])
+        fix[4] -= (params[_AGES + 2] + x[_POSE_DELAY]) * (params[_MEAN_ACCEL] - x[_ACCEL_BIAS])
 
 
 @njit
@@ -328,13 +332,13 @@ class SlipFilter(FilterObserver):
             process_variance=np.zeros(len(self.states) + n_rows),
             measurement_variance=np.ones(MOST_ROWS + 1 + len(_REFERENCES)),
             initial_variance=np.square(
-                [1e-3, 1e-3, 1e-3, 1.0, 0.1, 0.5, BIAS_STD_RADPS, UNTILTED_STD, DELAY_STD_S]
+                [1e-3, 1e-3, 1e-3, 1.0, 0.1, 0.5, BIAS_STD_RADPS, UNTILTED_STD, DELAY_STD_S, DELAY_STD_S]
                 + [SLOW_RATIO] * n_slow
                 + [loss_std] * turns
                 + [FAST_RATIO] * n_rows
             ),
             initial_mean=np.array(
-                [0.0] * _DELAY + [DELAY_S] + [0.0] * n_slow + [loss] * turns + [0.0] * n_rows
+                [0.0] * _GNSS_DELAY + [DELAY_S] * 2 + [0.0] * n_slow + [loss] * turns + [0.0] * n_rows
             ),
             inputs=_INPUTS,
             references=("pose", "gnss_position", "gnss_speed", "camera"),
@@ -349,8 +353,9 @@ class SlipFilter(FilterObserver):
         self._smooth_mps, self._accel_mps2, self._shaken_square = np.full(len(logged), np.nan), math.nan, 0.0
         self._pulls, self._accel_is_wrong, self._rolled_m = np.zeros(len(logged)), False, 0.0
         self._mean_mps = np.full(len(logged), np.nan)
-        self._has_delay, self._uphill, self._asked = False, 0.0, 0.0
-        bounds = [DELAY_BOUNDS_S, *[SLIP_BOUNDS] * (n_slow + turns + n_rows)]
+        self._has_delays: tuple[int, ...] = ()
+        self._uphill, self._asked = 0.0, 0.0
+        bounds = [DELAY_BOUNDS_S, DELAY_BOUNDS_S, *[SLIP_BOUNDS] * (n_slow + turns + n_rows)]
         self._bounds = np.array(bounds)
         self._poses = np.zeros((0, 4))  # age in ticks' time, position and heading
         self._pose_square, self._n_poses = np.square([POSE_STD_M, POSE_STD_RAD]), N_POSES
@@ -380,12 +385,12 @@ class SlipFilter(FilterObserver):
         gyro = given["yaw_rate_radps"]
         references = self._place(given, inputs)
         z = np.concatenate([z, [gyro if abs(gyro) <= MOST_RADPS else np.nan], references])
-        self._begin_delay(given)
+        self._begin_delays(given)
         self._take_pose(given)
         variance = self._variance(given, rates_mps2, dt_s)
         fix = self.advance(dt_s, z, inputs, self._walk(given, inputs, rates_mps2, dt_s), variance, N_JUDGED)
         mean = self.filter.mean
-        np.clip(mean[_DELAY:], self._bounds[:, 0], self._bounds[:, 1], out=mean[_DELAY:])
+        np.clip(mean[_GNSS_DELAY:], *self._bounds.T, out=mean[_GNSS_DELAY:])
         self._accel_is_wrong |= abs(float(mean[_ACCEL_BIAS])) > LARGEST_BIAS_MPS2
         output = self._output(speeds, inputs, fix)
         is_lost = self.filter.reference_age_s > LOST_S and (np.abs(output.slip) > LOST_RATIO).all()
@@ -460,7 +465,7 @@ class SlipFilter(FilterObserver):
         std[: rates_mps2.size] = np.hypot(self._scatter_mps, 0.29 * dt_s * rates_mps2)
         has_accel = math.isfinite(given["accel_x_mps2"])
         unknown_mps2 = math.sqrt(self._shaken_square) if has_accel else FREE_WALK
-        late_mps = (given["gnss_age_s"] + float(self.filter.mean[_DELAY])) * unknown_mps2
+        late_mps = (given["gnss_age_s"] + float(self.filter.mean[_GNSS_DELAY])) * unknown_mps2
         fix_m = given["gnss_std_m"] if given["gnss_std_m"] > 0.0 else FLOAT_STD_M
         std[MOST_ROWS:] = (
             *(GYRO_STD_RADPS, fix_m, fix_m, *[math.hypot(GNSS_SPEED_STD_MPS, late_mps)] * 2),
@@ -500,18 +505,15 @@ class SlipFilter(FilterObserver):
         walk[-n_rows:] = _fading(fast**2, FAST_S, dt_s)
         return walk
 
-    def _begin_delay(self, given: Mapping[str, float]) -> None:
-        """Begin with the delay that the description has of what measures the motion first."""
-        if self._has_delay:
-            return
-        for first, names in _DELAYS.items():
-            if math.isfinite(given[_REFERENCES[first]]):
-                self._has_delay = True
+    def _begin_delays(self, given: Mapping[str, float]) -> None:
+        """Begin with the delays that the description has of what begins to measure."""
+        for first, (state, *names) in _DELAYS.items():
+            if state not in self._has_delays and math.isfinite(given[_REFERENCES[first]]):
+                self._has_delays = (*self._has_delays, state)
                 if known := [
                     self._robot.identified[name] for name in names if name in self._robot.identified
                 ]:
-                    self.filter.mean[_DELAY], self.filter.cov[_DELAY, _DELAY] = known[0], KNOWN_STD_S**2
-                return
+                    self.filter.mean[state], self.filter.cov[state, state] = known[0], KNOWN_STD_S**2
 
     def _take_pose(self, given: Mapping[str, float]) -> None:
         """Learn how much poses scatter."""
@@ -544,12 +546,14 @@ class SlipFilter(FilterObserver):
         )
         yaw, turn_radps = float(mean[_YAW]), float(mean[_W])
         fix, pose = complex(z[0], z[1]), complex(z[4], z[5])
-        lever, age_s = complex(*params[_ANTENNA:_POSED]), float(ages_s[0]) + float(mean[_DELAY])
+        lever, late = complex(*params[_ANTENNA:_POSED]), _GNSS_DELAY
+        age_s = float(ages_s[0]) + float(mean[late])
         std_m = given["gnss_std_m"]
         place, turned, std = fix, math.nan, math.inf
         if math.isfinite(z[6]) and not cmath.isnan(pose):
             place, lever, std_m = pose, complex(*params[_POSED:_SEEN]), POSE_STD_M
-            age_s = float(ages_s[1]) + float(mean[_DELAY])
+            late = _POSE_DELAY
+            age_s = float(ages_s[1]) + float(mean[late])
             turned, std = z[6] - yaw + age_s * turn_radps, POSE_STD_RAD
         elif math.isfinite(z[7]) and not cmath.isnan(fix):
             turned, std = z[7] - yaw, COMPASS_STD_RAD
@@ -570,8 +574,9 @@ class SlipFilter(FilterObserver):
             origin = place + age_s * moved - lever * forward * cmath.exp(1j * turned)
             mean[_X], mean[_Y] = origin.real, origin.imag
             along = np.array([moved.real, moved.imag])
-            cov[:2, :2] += cov[_DELAY, _DELAY] * np.outer(along, along)
-            cov[:2, _DELAY] = cov[_DELAY, :2] = cov[_DELAY, _DELAY] * along
+            cov[:2, :2] += cov[late, late] * np.outer(along, along)
+            cov[:2, _VX:] = np.outer(along, cov[late, _VX:])
+            cov[_VX:, :2] = cov[:2, _VX:].T
         self._is_placed = True
         return z
 

@@ -85,7 +85,9 @@ def run_filter(robot, time_s, rows, start=0):
     """Return the filter, and its track over rows by name; what is not given is unknown."""
     filter_ = SlipFilter(robot)
     table = np.column_stack([rows.get(name, np.full(len(time_s), np.nan)) for name in filter_.rows])
-    return filter_, observe(filter_, time_s[start:], table[start:])
+    track = observe(filter_, time_s[start:], table[start:])
+    assert not any("numerical" in kind for kind in filter_.filter.dropped)
+    return filter_, track
 
 
 # -- laws ------------------------------------------------------------------------------------------------------------
@@ -125,8 +127,8 @@ def test_a_wheel_that_stands_tells_the_ground_stands_and_nothing_of_its_slip():
 def test_a_delay_of_the_receiver_is_learned_and_leaves_slip_as_it_is(delay_s):
     time_s, rows, _ = drive(MINE, n=3000, delay_s=delay_s)
     _, track = run_filter(MINE, time_s, rows)
-    std_s = track.std[-1, track.states.index("fix_delay_s")]
-    assert track.state("fix_delay_s")[-1] == pytest.approx(delay_s, abs=3.0 * std_s)
+    std_s = track.std[-1, track.states.index("gnss_delay_s")]
+    assert track.state("gnss_delay_s")[-1] == pytest.approx(delay_s, abs=3.0 * std_s)
     assert std_s < 0.03
     assert np.abs(track.slip[-1000:] - 0.1).max() < 0.03
 
@@ -151,6 +153,21 @@ def test_positions_or_speeds_alone_show_the_heading(missing):
     _, track = run_filter(HUSKY, time_s, {name: row for name, row in rows.items() if name not in missing})
     assert np.abs(wrapped(track.state("yaw_rad") - true["yaw"]))[time_s > 10.0].max() < 0.08
     assert np.abs(track.slip[time_s > 15.0] - 0.1).max() < 0.04
+
+
+def test_a_receiver_that_comes_after_a_camera_is_used_from_where_it_shows_the_heading():
+    time_s, rows, true = drive(HUSKY, n=1000, delay_s=0.1)
+    moves = rng_speeds(true["vx"])
+    rows["camera_x_mps"], rows["camera_y_mps"], rows["camera_age_s"] = moves, 0.0 * moves, 0.0 * moves
+    for name in ("gnss_x_m", "gnss_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps"):
+        rows[name] = np.where(time_s < 2.0, np.nan, rows[name])
+    filter_, track = run_filter(HUSKY, time_s, rows)
+    assert filter_.reference_age_s < 0.1
+    assert np.abs(track.slip[-200:] - 0.1).max() < 0.05
+
+
+def rng_speeds(speed_mps):
+    return speed_mps + 0.03 * np.random.default_rng(8).standard_normal(len(speed_mps))
 
 
 def test_spinning_wheels_show_no_heading_and_slip_that_is_seen_is_one():
