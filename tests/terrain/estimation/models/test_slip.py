@@ -156,12 +156,12 @@ def test_positions_or_speeds_alone_show_the_heading(missing):
 
 
 def test_a_receiver_that_comes_after_a_camera_is_used_from_where_it_shows_the_heading():
-    time_s, rows, true = drive(HUSKY, n=1000, delay_s=0.1)
+    time_s, rows, true = drive(MINE, n=1000, delay_s=0.1)
     moves = rng_speeds(true["vx"])
     rows["camera_x_mps"], rows["camera_y_mps"], rows["camera_age_s"] = moves, 0.0 * moves, 0.0 * moves
     for name in ("gnss_x_m", "gnss_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps"):
         rows[name] = np.where(time_s < 2.0, np.nan, rows[name])
-    filter_, track = run_filter(HUSKY, time_s, rows)
+    filter_, track = run_filter(MINE, time_s, rows)
     assert filter_.reference_age_s < 0.1
     assert np.abs(track.slip[-200:] - 0.1).max() < 0.05
 
