@@ -395,8 +395,7 @@ def measured_slip(
     rollers = robot.on_omni_wheels, robot.roller_angles_rad
     rolled_twist, _ = no_slip_twist(place_m, direction, u, *rollers)
     speed = np.linalg.norm(rolled_twist[:, :2], axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ahead = rolled_twist[:, :2] / speed[:, None]
+    ahead = rolled_twist[:, :2] / np.where(speed > 0.0, speed, np.nan)[:, None]
     body = (twist[:, :2] * ahead).sum(axis=1)
     body_std = np.sqrt(((ahead * twist_std[:, :2]) ** 2).sum(axis=1))
     body_slip, body_slip_std = _slip(speed, np.sqrt((u_std**2).mean(axis=1)), body, body_std)
