@@ -19,7 +19,7 @@ import numpy as np
 import terrain
 from pipelines.live.pilot import LivePilot, pilot_classifier
 from pipelines.report.figure import Figure, Line, Panel, Points
-from pipelines.report.numbers import enumerated
+from pipelines.report.numbers import enumerated, format_value
 from pipelines.report.tree import Column, Report, Table, Text, sections
 from terrain.control.robot_control import PilotSettings
 from terrain.control.slip_table import SlipTable, load_slip_table
@@ -95,7 +95,7 @@ def slips(learn: Sequence[RunLog], held: Sequence[RunLog], robot: Robot, answer:
             first = rows[0]
             answer.lead.append(
                 f"without the outside measurement slip of held-out {first.held_out} is off by {first.rms:.3f} rms, "
-                f"{first.coverage:.0%} inside its 95 %"
+                f"{format_value(first.coverage, '.0%')} inside its 95 %"
             )
             columns = (
                 *(Column(name, of=at) for name, at in (("held out", "held_out"), ("runs", "n_runs"))),
@@ -191,7 +191,9 @@ def classifier(learn: Sequence[RunLog], held: Sequence[RunLog], answer: Answer) 
     except TerrainError as error:
         answer.unknown.append(f"the ground, live, which is taken as labelled: {error}")
         return None
-    answer.parts.append(Text(f"Of the windows of runs held out {right:.0%} are classified rightly."))
+    answer.parts.append(
+        Text(f"Of the windows of runs held out {format_value(right, '.0%')} are classified rightly.")
+    )
     return model.model_
 
 
@@ -246,7 +248,8 @@ def replayed(
         f"commands of {len(rows)} replayed runs are {finite}{within}, {min(ratios):.2f} to {max(ratios):.2f} of what "
         "was driven"
     )
-    time_s, *series = found[len(found) // 2].T
+    most = int(np.argmax([np.abs(each[:, 1 + len(robot.wheels) :]).sum() for each in found]))
+    time_s, *series = found[most].T
     panels = []
     for i, wheel in enumerate(robot.wheels):
         lines = (
@@ -254,7 +257,7 @@ def replayed(
             Line("driven", time_s, series[i + len(robot.wheels)], 1),
         )
         panels.append(Panel(lines, f"wheel {wheel} [rad/s]"))
-    title = f"{rows[len(rows) // 2][0]}: commands of the pilot, and what was driven"
+    title = f"{rows[most][0]}: commands of the pilot, and what was driven"
     answer.figures.insert(0, Figure(title, panels, open_loop, "time in s"))
     return found
 
@@ -265,10 +268,9 @@ def chain(folder: Path, name: str, every: bool = False) -> Report:
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", DoubtfulRunWarning)
         runs = [run for run in terrain.load_runs(folder, robot=name) if run.robot == robot.name]
-    if doubts:
-        answer.unknown.append(
-            f"whether all is as logged, in {len(doubts)} doubts; the first: {doubts[0].message}"
-        )
+    names = {run.run_id for run in runs}
+    if about := [text for text in (str(each.message) for each in doubts) if text.partition(":")[0] in names]:
+        answer.unknown.append(f"whether all is as logged, in {len(about)} doubts; the first: {about[0]}")
     if ground := GROUND.get(folder.name):
         runs = [replace(run, labels=(Label(0.0, run.end_s, ground),)) for run in runs]
         answer.unknown.append(
@@ -284,7 +286,7 @@ def chain(folder: Path, name: str, every: bool = False) -> Report:
         f"The whole chain of {robot.name}, {folder.name}",
         f"{'; '.join(answer.lead)}.",
         answer.figures[0],
-        [*answer.parts, *[Text(f"Not known: {each.rstrip('.')}.", "note") for each in answer.unknown]],
+        [*answer.parts, *[Text(f"Not known: {each.rstrip('.?')}.", "note") for each in answer.unknown]],
         sections(("Pictures", answer.figures[1:])),
         lead=f"{len(learn) + len(held)} of {len(runs)} runs, {len(held)} of them held out whole",
     )

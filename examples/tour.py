@@ -4,7 +4,7 @@ import terrain
 
 runs = terrain.load_runs("logs/")
 robot = terrain.load_robot("husky")
-tracks = terrain.estimate(runs, robot, filter="skid")  # state and slip, with standard deviations
+tracks = terrain.estimate(runs, robot)  # state and slip, with standard deviations
 windows = terrain.cut_windows(tracks.runs, length_s=2.0)
 model = terrain.TerrainClassifier("svm")  # a scikit-learn estimator, as is a user's own
 print(terrain.cross_validate(model, windows))  # whole runs held out; the report, also in a notebook

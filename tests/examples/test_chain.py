@@ -116,7 +116,7 @@ def test_each_robot_goes_from_log_to_commands(script, measured, monkeypatch, rob
 @pytest.mark.slow
 def test_slip_of_robotino_is_predicted_without_the_camera_as_well_as_it_was(script, measured):
     report = script.chain(measured("robotino") / "one_surface", "robotino", every=True)
-    rms, inside = re.search(r"is off by (\d\.\d+) rms, (\d+)%", report.answer).groups()
+    rms, inside = re.search(r"is off by (\d\.\d+) rms, (\d+).%", report.answer).groups()
     assert float(rms) <= 0.045
     assert 90 <= int(inside) <= 98
     assert float(re.search(r"off by at most (\d\.\d+)", report.answer).group(1)) <= 0.03
