@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import threading
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 
 from pipelines.learn.model_file import write_model
 from pipelines.learn.predict import predict
+from pipelines.live.pilot import LivePilot
 from pipelines.serve import replay
 from pipelines.serve.replay import chain_of_run, replay_run
 from pipelines.serve.serve import Settings
@@ -127,6 +129,24 @@ def test_serve_replays_all_runs_of_a_folder_as_predict_and_prints_changes(
     assert "believed unknown" in printed[0]
     assert len(result.to_pandas()) == result.n_windows
     assert f"{result.n_windows} windows in 4" in str(result.report)
+
+
+def test_a_pilot_is_given_the_motion_that_commanded_wheels_desire(runs, tmp_path, monkeypatch):
+    """A log of DRIVE's layout commands wheels and no twist."""
+    rates = Stream([0.0, 20.0], [[2.0, 4.0]] * 2, ["wheel_left_radps", "wheel_right_radps"])
+    write_run(replace(runs[0], streams={**runs[0].streams, "commands": rates}), tmp_path / "logs")
+    desired, take = [], LivePilot.take
+
+    def seen(pilot, sample):
+        desired.append(sample.twist)
+        return take(pilot, sample)
+
+    monkeypatch.setattr(LivePilot, "take", seen)
+    result = serve(Settings(replay=tmp_path / "logs"))
+    assert [run.chain for run in result.runs] == ["pilot"]
+    husky = load_robot("husky")
+    radius_m, track_m = husky.wheel_radius_m, husky.track_m
+    np.testing.assert_allclose(desired[-1], [3.0 * radius_m, 0.0, 2.0 * radius_m / track_m])
 
 
 def test_a_signal_ends_the_command_with_a_summary(logs, husky_folder, tmp_path, terrain, monkeypatch):
