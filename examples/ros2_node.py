@@ -56,7 +56,9 @@ def terrain_node(model: Path, robot_name: str = "") -> Node:
                 publish_belief()
             return
         earlier = waiting.get(stream)
-        waiting[stream] = reading if earlier is None else Reading(*map(np.concatenate, zip(earlier, reading, strict=True)))
+        waiting[stream] = (
+            reading if earlier is None else Reading(*map(np.concatenate, zip(earlier, reading, strict=True)))
+        )
 
     def on_twist(message: Twist) -> None:  # fifty times a second; the newest sample tells the time
         stamps = [reading.time_s[-1] for reading in waiting.values()]

@@ -929,6 +929,17 @@ def description_file(name_or_path: str | Path) -> Path:
     return described_file(name_or_path, "robot", "robots")
 
 
+def robot_argument(name: str) -> str:
+    """Return what a command takes for a robot that a log names: the name, or the file of one that is not packaged.
+
+    Examples
+    --------
+    >>> robot_argument("husky"), robot_argument("mine")
+    ('husky', 'mine.yaml')
+    """
+    return name if name in packaged("robots") else f"{name}.yaml"
+
+
 def robot_named(name: str, given: Robot | None = None) -> Robot:
     """Return the robot that a log names: the one that is given, where it bears the name, else the package's.
 

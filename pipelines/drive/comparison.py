@@ -58,7 +58,7 @@ from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import KnownTerrain, TerrainSource
 from terrain.errors import ConfigError
 from terrain.records import RunLog
-from terrain.robots import Robot, load_robot
+from terrain.robots import Robot, load_robot, robot_argument
 from terrain.simulation.assumed import with_assumed
 from terrain.simulation.run import simulate_run
 from terrain.terramechanics.soil import soil_names
@@ -274,7 +274,7 @@ def report(result: DriveResult) -> Report:
             ("The curves behind the targets", _curve_parts(result.slip_table)),
             ("Where these numbers come from", _provenance(result)),
         ),
-        next_step=f"terrain drive --faults all --robot {result.robot}",
+        next_step=f"terrain drive --faults all --robot {robot_argument(result.robot)}",
     )
 
 

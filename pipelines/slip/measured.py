@@ -19,7 +19,7 @@ from pipelines.slip.shown import within_one_session
 from pipelines.slip.tracks import Keep, TracksResult
 from terrain.errors import DataError
 from terrain.records import RunLog
-from terrain.robots import OmniRobot, Robot, SwerveRobot, as_drive
+from terrain.robots import OmniRobot, Robot, SwerveRobot, as_drive, robot_argument
 from terrain.signals import Delay
 from terrain.slip_learning.currents import PredictionFigures, predictions
 from terrain.slip_learning.measured import (
@@ -213,7 +213,7 @@ def report(result: MeasuredSlipResult) -> Report:
             ("Without a slip", result.not_measured),
             ("Not read", result.skipped),
         ),
-        f"terrain learn-slip --data DIR --robot {result.robot} --out table.yaml",
+        f"terrain learn-slip --data DIR --robot {robot_argument(result.robot)} --out table.yaml",
     )
 
 

@@ -125,5 +125,5 @@ def report(result: CalibrationResult) -> Report:
         "them were described outside their 95 % interval.",
         parts=[first, Text(text, "note")] if n_unknown else [first],
         details=sections(all_numbers, ("Not determined", unknown), ("Assumed", assumed)),
-        next_step=f"terrain estimate --data DIR --filter FILTER --robot {result.out or 'FILE'} --out runs/",
+        next_step=f"terrain estimate --data DIR --robot {result.out or 'FILE'} --out runs/",
     )

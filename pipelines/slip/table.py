@@ -14,6 +14,7 @@ from pipelines.report.results import Result, described
 from pipelines.report.tree import Column
 from terrain.control.slip_table import DRIVE_STATES, SlipTable, write_slip_table
 from terrain.records import Array
+from terrain.robots import robot_argument
 
 SLIP, TARGET = ".3f", "+.3f"
 
@@ -47,7 +48,7 @@ class LearnedSlipTable(Result, SlipTable, eq=False, kw_only=True):
     def next_step(self) -> str:
         """The command that drives by this table."""
         terrain = next((name for name in self.targets if name != self.fallback), "TERRAIN")
-        return f"terrain drive --robot {self.robot} --terrain {terrain} --table {self.table or 'FILE'}"
+        return f"terrain drive --robot {robot_argument(self.robot)} --terrain {terrain} --table {self.table or 'FILE'}"
 
 
 def law_marks(

@@ -9,9 +9,10 @@ root mean square U of all of them, is
 - **m**, the slip of this ground, of each side of a robot that skids and each wheel that rolls across, else of all
   wheels: a random walk while the robot moves, the same forward and backward, and through standstill.
 - **chi**, what is lost in turning.  Robots that skid: :math:`t = \mp (u_r - u_l) / 2` left and right, so that straight
-  motion does not show it and the effective track is :math:`B / (1 - \chi)` (Mandow et al., Experimental kinematics for
-  wheeled skid-steer mobile robots, IROS 2007).  Robots that steer: a row across the front wheel, which does not slide,
-  with :math:`t = u \sin \delta`, so that chi is what understeer takes of the curvature.
+  motion does not show it, m counts the less the tighter the turn is, and in a turn on the spot the effective track is
+  :math:`B / (1 - \chi)` (Mandow et al., Experimental kinematics for wheeled skid-steer mobile robots, IROS 2007).
+  Robots that steer: a row across the front wheel, which does not slide, with :math:`t = u \sin \delta`, so that chi is
+  what understeer takes of the curvature.
 - **d**, what slip deviates by for moments, as traction and turning change: forgotten within :data:`FAST_S`, with a
   deviation that grows with the acceleration of the wheels and how tight the turn is.
 
@@ -67,7 +68,7 @@ from terrain.slip import MIN_SPEED_MPS, slip_ratio
 
 FAST_S, ACROSS_S = 0.5, 5.0
 """Over which d, and sideways speed of a robot that cannot drive sideways, are forgotten."""
-FAST_RATIO, FAST_PER_MPS2, FAST_TURNING = 0.01, 0.2, 0.06
+FAST_RATIO, FAST_PER_MPS2, FAST_TURNING = 0.01, 0.3, 0.06
 """Standard deviation of d in steady straight motion; what an acceleration of the wheels of 1 m/s^2, a tenth of the
 weight in traction, adds; and what turning on the spot does."""
 YIELDING_RATIO = 0.3
@@ -193,7 +194,6 @@ def _wheels(x: Array, params: Array, z: Array) -> None:
 def _placed(x: Array, sensor: int, lever_x: float, lever_y: float, params: Array, z: Array) -> None:
     """Write position and velocity in the world of a point of the body, an age ago."""
     age, accel = params[_AGES + sensor] + x[_GNSS_DELAY + min(sensor, 1)], params[_MEAN_ACCEL]
-    accel = accel - x[_ACCEL_BIAS] if math.isfinite(accel) else 0.0
     along, across = x[_VX] - age * (accel + x[_W] * x[_VY]), x[_VY]
     middle, then = x[_YAW] - 0.5 * age * x[_W], x[_YAW] - age * x[_W]
     mean = 0.5 * (along + x[_VX])
@@ -219,8 +219,7 @@ def _measure(x: Array, _dt: float, params: Array, z: Array) -> None:
     fix[3] = x[_YAW]
     fix[4] = x[_VX] - x[_W] * params[_SEEN + 1]
     fix[5] = x[_VY] + x[_W] * params[_SEEN]
-    if math.isfinite(params[_MEAN_ACCEL]):
-        fix[4] -= (params[_AGES + 2] + x[_POSE_DELAY]) * (params[_MEAN_ACCEL] - x[_ACCEL_BIAS])
+    fix[4] -= (params[_AGES + 2] + x[_POSE_DELAY]) * params[_MEAN_ACCEL]
 
 
 @njit
@@ -354,7 +353,7 @@ class SlipFilter(FilterObserver):
         self._pulls, self._accel_is_wrong, self._rolled_m = np.zeros(len(logged)), False, 0.0
         self._mean_mps = np.full(len(logged), np.nan)
         self._has_delays: tuple[int, ...] = ()
-        self._uphill, self._asked = 0.0, 0.0
+        self._uphill, self._asked, self._apart_mps2 = 0.0, 0.0, 0.0
         bounds = [DELAY_BOUNDS_S, DELAY_BOUNDS_S, *[SLIP_BOUNDS] * (n_slow + turns + n_rows)]
         self._bounds = np.array(bounds)
         self._poses = np.zeros((0, 4))  # age in ticks' time, position and heading
@@ -375,7 +374,7 @@ class SlipFilter(FilterObserver):
         self._mean_mps = before_mps + gain * np.nan_to_num(speeds - before_mps)
         rates_mps2 = self._rates(speeds, dt_s)
         angles = np.array([given[name] for name in self._steer])
-        inputs = self._inputs(given, speeds, before_mps, angles, dt_s)
+        inputs = self._inputs(given, speeds, rates_mps2, before_mps, angles, dt_s)
         z, logged, across = np.full(MOST_ROWS, np.nan), *self._wheels[:2]
         z[: logged.size] = np.where(np.isin(logged, across[np.isnan(angles)]), np.nan, 0.0 * speeds)
         if np.isfinite(speeds).any():
@@ -413,7 +412,13 @@ class SlipFilter(FilterObserver):
         return np.asarray(behind / CHANGE_S)
 
     def _inputs(
-        self, given: Mapping[str, float], speeds: Array, before_mps: Array, angles: Array, dt_s: float
+        self,
+        given: Mapping[str, float],
+        speeds: Array,
+        rates_mps2: Array,
+        before_mps: Array,
+        angles: Array,
+        dt_s: float,
     ) -> Array:
         """Return the inputs of a tick; a steered wheel's direction is that of its angle.
 
@@ -449,22 +454,42 @@ class SlipFilter(FilterObserver):
         size = math.sqrt(max(float(np.mean(known**2)), float(np.mean(before_mps**2))))
         ages = [given[name] if 0.0 <= given[name] <= OLDEST_S else 0.0 for name in _AGE_ROWS]
         inputs[: 3 * MOST_ROWS], inputs[_SPEEDS][:n], inputs[_TURNING] = rolling.ravel(), known, turning
+        if self._robot.skids and size > 0.0:  # turning on the spot says nothing of slip straight ahead
+            before_mps = before_mps * (1.0 - min(abs(float(turning[0])) / size, 1.0) ** 2)
         inputs[_SMOOTH][:n] = before_mps
-        inputs[_SIZE - _D :] = size, accel, self._accel_mps2, *ages
+        inputs[_SIZE - _D :] = size, accel, self._since_fix(rates_mps2, rolling[:n, 0]), *ages
         self.accel_mps2 = accel - float(self.filter.mean[_ACCEL_BIAS])
         return inputs
+
+    def _since_fix(self, rates_mps2: Array, ahead: Array) -> float:
+        """Return the acceleration ahead by which fixes that are old are brought to their instant.
+
+        It is what low-passed accelerometer and wheels both show: a ground that shakes the one and wheels that spin are
+        none, and a delay that was multiplied by their noise would come out short.
+        """
+        weight = float(ahead @ ahead)
+        by_wheels = float(ahead @ rates_mps2) / weight if weight > 0.0 else 0.0
+        if math.isnan(self._accel_mps2) or self._accel_is_wrong:
+            self._apart_mps2 = 0.5 * abs(by_wheels)
+            return by_wheels
+        measured = self._accel_mps2 - float(self.filter.mean[_ACCEL_BIAS])
+        both = (
+            math.copysign(min(abs(measured), abs(by_wheels)), by_wheels)
+            if measured * by_wheels > 0.0
+            else 0.0
+        )
+        self._apart_mps2 = 0.5 * abs(measured - by_wheels)
+        return both
 
     def _variance(self, given: Mapping[str, float], rates_mps2: Array, dt_s: float) -> Array:
         """Return the variance of each measurement.
 
-        A wheel's speed is a mean over a tick, half of one late.  A receiver's speed is of an age ago; what it has
-        changed by since is that of the low-passed acceleration, which a shaken one is off by, or of none.  (By that of
-        a tick alone the delay would come out short: its error would be in what the delay is multiplied by.)
+        A wheel's speed is a mean over a tick, half of one late.  A measured speed is of an age ago; what it has changed
+        by since is uncertain by what wheels and accelerometer do not agree on.
         """
         std = np.full(MOST_ROWS + 1 + len(_REFERENCES), self._scatter_mps)
         std[: rates_mps2.size] = np.hypot(self._scatter_mps, 0.29 * dt_s * rates_mps2)
-        has_accel = math.isfinite(given["accel_x_mps2"])
-        unknown_mps2 = math.sqrt(self._shaken_square) if has_accel else FREE_WALK
+        unknown_mps2 = self._apart_mps2
         late_mps = (given["gnss_age_s"] + float(self.filter.mean[_GNSS_DELAY])) * unknown_mps2
         fix_m = given["gnss_std_m"] if given["gnss_std_m"] > 0.0 else FLOAT_STD_M
         std[MOST_ROWS:] = (
@@ -496,7 +521,8 @@ class SlipFilter(FilterObserver):
                 self._uphill += -math.expm1(-dt_s / SLOPE_S) * (-math.sin(given["pitch_rad"]) - self._uphill)
             asked = self._uphill * math.copysign(1.0, float(inputs[_SPEEDS].sum()))
             changed = DIRECTION_RATIO**2 * turned + SLOPE_RATIO2 * abs(asked - self._asked)
-            walk[_SLOW : _SLOW + n_slow] = SLOW_WALK**2 + changed / dt_s
+            known = self.filter.cov.diagonal()[_SLOW : _SLOW + n_slow] < SLOW_RATIO**2
+            walk[_SLOW : _SLOW + n_slow] = np.where(known, SLOW_WALK**2 + changed / dt_s, 0.0)
             self._pulls, self._asked = pulls, asked
             walk[_SLOW + n_slow : len(self.states)] = (TURN_WALK * tight) ** 2
         self._rolled_m = self._rolled_m + size * dt_s if size > STANDING_MPS else 0.0
