@@ -219,7 +219,8 @@ def parameters_of(robot: Robot, source: str, has_gyro: bool) -> tuple[str, ...]:
         own = ["wheelbase_ratio"], ["understeer_s2pm", "cornering_stiffness_ratio"]
         names += own[0] if robot.front_driven else own[1]
     names += ["steering_delay_s"] * robot.steered
-    names += ["camera_yaw_rad"] * (source != "gnss") + ["lever_x_m", "lever_y_m", "camera_latency_s"]
+    names += ["camera_yaw_rad"] * (source != "gnss") + ["lever_x_m", "lever_y_m"]
+    names += ["camera_latency_s"]
     return (*names, *["wheels_delay_s", "gyro_scale_ratio"] * has_gyro)
 
 

@@ -54,7 +54,7 @@ def test_the_runner_lists_studies_and_names_a_mistake(capsys):
     listed = capsys.readouterr().out
     assert all(name in listed for name in STUDIES)
     assert main(["nothing"]) == 2
-    assert "there is no study 'nothing'; there are consistency, " in capsys.readouterr().err
+    assert "there is no study 'nothing'; there are slip, " in capsys.readouterr().err
     assert main(["trials", "--runs", "2"]) == 2
     assert capsys.readouterr().err == "error: --runs is 2; at least 3 are required, to hold some out\n"
 

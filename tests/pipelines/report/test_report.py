@@ -179,7 +179,8 @@ def test_all_that_derives_from_a_result():
     assert found.to_pandas().to_dict("records") == [{"name": "husky", "kind": "a", "ratio": 0.25}]
     schema = Found.schema()["properties"]
     assert schema["ratio"] == {"description": "of slip", "unit": "1"}
-    assert list(schema) == list(found.as_json())
+    assert list(schema) == ["doubtful", *found.as_json()]
+    assert list(schema) == list(found.with_doubts(["a clock jumps"]).as_json())
 
 
 class Colour(Enum):

@@ -223,7 +223,7 @@ def test_a_skid_steer_robot_without_sections_is_corrected_in_its_samples():
 #: Where a run as measured meets the robot as described.
 EDGES = {
     *(f"terrain/estimation/{name}.py" for name in ("estimate", "observe", "tuning")),
-    *(f"pipelines/live/{name}.py" for name in ("windows", "classifying", "pilot")),
+    *(f"pipelines/live/{name}.py" for name in ("windows", "classifying", "observer", "pilot")),
     "terrain/slip_learning/learn.py",
 }
 
