@@ -11,7 +11,7 @@ import pytest
 from filterpy.kalman import ExtendedKalmanFilter
 from threadpoolctl import threadpool_limits
 
-from terrain.estimation.filter import Filter, FilterSettings, run_filter
+from terrain.estimation.filter import Filter, FilterSettings, process_noise, run_filter
 from terrain.estimation.models.swerve import make_filter
 from terrain.robots import load_robot
 
@@ -39,7 +39,7 @@ def with_filterpy(model, z):
     x_next, f, z_hat, h = np.zeros(d), np.zeros((d, d)), np.zeros(m), np.zeros((m, d))
     ekf = ExtendedKalmanFilter(d, m)
     ekf.x, ekf.P = model.initial_mean.copy(), model.initial_variance.copy()
-    ekf.Q, ekf.R = model.process_variance * DT_S, np.diag(model.measurement_variance)
+    ekf.Q, ekf.R = process_noise(model, DT_S), np.diag(model.measurement_variance)
     ekf.predict_x = lambda u=0: ekf.x.__setitem__(slice(None), x_next)
 
     def jacobian(x):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from terrain.estimation.models.choice import OBSERVERS, make_observer, observers_of
+from terrain.estimation.models.observer import FIX_ROWS, PLACE_ROWS
 from terrain.estimation.models.slip_model import SlipModel
 from terrain.robots import load_robot
 
@@ -32,8 +33,9 @@ DRIVEN = {
 @pytest.mark.parametrize("name", OBSERVERS)
 def test_a_step(benchmark, name):
     robot = PATAKO if name in observers_of(PATAKO) else CAR
-    rows = np.tile([DRIVEN.get(row, 0.0) for row in make_observer(name, robot, MODEL).rows], (N_STEPS, 1))
-    fix = [k for k, row in enumerate(make_observer(name, robot, MODEL).rows) if row not in DRIVEN]
+    names = make_observer(name, robot, MODEL).rows
+    rows = np.tile([DRIVEN.get(row, np.nan) for row in names], (N_STEPS, 1))
+    fix = [names.index(row) for row in (*PLACE_ROWS, *FIX_ROWS["pose"]) if row in names]
     time_s = 0.02 * np.arange(N_STEPS)
     pose = np.stack([4.0 * np.sin(0.05 * time_s), 4.0 * (1 - np.cos(0.05 * time_s)), 0.05 * time_s], axis=1)
     rows[:, fix] = np.where((np.arange(N_STEPS) % 5 == 0)[:, None], pose[:, : len(fix)], np.nan)
