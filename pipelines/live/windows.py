@@ -37,7 +37,7 @@ def needs_filter(info: ModelInfo, streams: Container[str]) -> bool:
 
 
 def live_filter(info: ModelInfo, robot: Robot) -> str:
-    """Return the filter that gives what a model was trained on.
+    """Return the filter that gives what a model was trained on; of one that does not name it the first that gives that.
 
     Raises
     ------
@@ -45,13 +45,23 @@ def live_filter(info: ModelInfo, robot: Robot) -> str:
         if that filter is none of the robot's.
     """
     filters = LIVE_FILTERS.get(robot.drive, ())
-    name = info.filter or (filters[0] if filters else "")
+    giving = (name for name in filters if _gives(name, robot, info))
+    name = info.filter or next(giving, filters[0] if filters else "")
     if name not in filters:
         raise DataError(
             f"the model was trained on estimates of the filter {name!r}, which robot {robot.name} does not "
             f"run live (its filters: {', '.join(filters) or 'none'})"
         )
     return name
+
+
+def _gives(name: str, robot: Robot, info: ModelInfo) -> bool:
+    """Say whether a filter or observer that needs nothing else gives all estimates that a model takes."""
+    try:
+        found = estimated_channels(name, robot)
+    except ConfigError:  # one that needs a slip model, or that the description leaves out
+        return False
+    return all(set(info.channels.get(stream, ())) <= set(found[stream]) for stream in ESTIMATED)
 
 
 def live_estimator(

@@ -175,6 +175,7 @@ def test_slip_changes_with_the_ground_sample_by_sample():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::terrain.errors.OutsideRegionWarning")  # of these few runs
 def test_the_tour_goes_through_the_whole_chain(tmp_path, monkeypatch, capsys):
     import terrain
 
