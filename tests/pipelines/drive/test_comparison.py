@@ -99,7 +99,7 @@ class Scripted:
 
 @pytest.mark.slow
 def test_the_thesis_takes_the_targets_of_the_classified_terrain(monkeypatch):
-    monkeypatch.setattr(comparison, "Classifier", lambda model, robot: Scripted("grass", 0.9))
+    monkeypatch.setattr(comparison, "pilot_classifier", lambda *given: Scripted("grass", 0.9))
     settings = SHORT.with_(controllers=("thesis", "thesis:classified"), seeds=1, duration_s=16.0)
     result = compare(settings, DriveInputs(ROBOT, TABLE, TerrainModel(None, None)))  # for the source alone
     base, classified = (result.controllers[name] for name in ("thesis", "thesis:classified"))
