@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MAX_LINES = {"terrain": 60_500, "features": 2_750, "pipelines": 20_900, "tests": 54_000}
+MAX_LINES = {"terrain": 57_200, "features": 2_680, "pipelines": 20_170, "tests": 51_500}
 """Lines of Python, docstrings included."""
 
 
