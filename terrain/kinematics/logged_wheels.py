@@ -69,10 +69,11 @@ def with_desired_twist(run: RunLog, robot: Robot) -> RunLog:
 
     Examples
     --------
+    >>> from terrain.robots import load_robot
     >>> rates = Stream(np.arange(2.0), np.full((2, 2), 10.0), ["wheel_left_radps", "wheel_right_radps"])
     >>> run = with_desired_twist(RunLog("a", "husky", {"commands": rates}), load_robot("husky"))
     >>> run.streams["commands"].columns(TWIST)[0].round(3)
-    array([1.651, 0.   , 0.   ])
+    array([1.65, 0.  , 0.  ])
     """
     commands, rates = run.streams.get("commands"), [f"wheel_{wheel}_radps" for wheel in robot.wheels]
     if commands is None or robot.steered_wheels or not set(rates) <= set(commands.channels):

@@ -85,7 +85,7 @@ def observers_of(robot: Robot) -> tuple[str, ...]:
     --------
     >>> from terrain.robots import load_robot
     >>> observers_of(load_robot("adap2e")), observers_of(load_robot("husky"))
-    (('sideslip-kinematic', 'sideslip-dynamic', 'sideslip-multi'), ())
+    (('slip', 'sideslip-kinematic', 'sideslip-dynamic', 'sideslip-multi'), ('slip',))
     """
     known = OBSERVERS_OF_DRIVE.get(robot.drive, {})
     return tuple(name for name in known if not robot.filters or name in robot.filters)
