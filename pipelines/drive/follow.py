@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 #: Desired speed unless another is given, over that of the motors and at the most.
 SPEED_RATIO, SPEED_MPS = 0.6, 1.0
 DISTANCE = "distance along the path [m]"
+SHOWN_M = 1.5  #: Lateral errors beyond this leave the figure
 COLUMNS = ("time_s", "distance_m", "lateral_m", "position_x_m", "position_y_m", "speed_mps", "slip_ratio")
 
 
@@ -189,7 +190,7 @@ def report(result: FollowResult) -> Report:
         title=f"{result.robot} along {result.path.name}",
         answer=verdict(result),
         lead=f"{result.speed_mps:.3g} m/s · {result.terrain} · table {result.table} · seed {result.seed}",
-        picture=_lateral_figure(result),
+        picture=lateral_figure(result.drive[:, 1], result.drive[:, 2] - result.offset_m, result.limit_m),
         parts=[*(Text(text, "warning") for text in warnings), Pairs(figures)],
         details=[
             Section("Path and robot", list(_map(result))),
@@ -210,13 +211,12 @@ def verdict(result: FollowResult) -> str:
     )
 
 
-def _lateral_figure(result: FollowResult) -> Figure:
-    drive, limit = result.drive, result.limit_m
-    error, ends = drive[:, 2] - result.offset_m, drive[[0, -1], 1]
-    most = 1.1 * min(max(limit, float(np.abs(error).max())), 1.5)
+def lateral_figure(distance_m: Array, error_m: Array, limit_m: float) -> Figure:
+    """Show the lateral error (n,) along a path, and a tenth of the speed."""
+    most = 1.1 * min(max(limit_m, float(np.abs(error_m).max())), SHOWN_M)
     marks = (
-        Band("a tenth of the speed", ends, [-limit] * 2, [limit] * 2, 6),
-        Line("lateral error", drive[:, 1], error, 0),
+        Band("a tenth of the speed", distance_m[[0, -1]], [-limit_m] * 2, [limit_m] * 2, 6),
+        Line("lateral error", distance_m, error_m, 0),
     )
     return Figure(
         "Lateral error along the path",

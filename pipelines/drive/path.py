@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.drive.drive import PAGE_FILE
-from pipelines.drive.follow import FollowResult, follow
+from pipelines.drive.follow import DISTANCE, FollowResult, follow, lateral_figure
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
 from pipelines.report.numbers import format_counts, format_value
 from pipelines.report.results import Progress, Result, described
@@ -41,9 +41,7 @@ if TYPE_CHECKING:
 
 SPEED_MPS = 3.0  #: Unless another is given
 
-DISTANCE = "distance along the path [m]"
 
-SHOWN_M = 1.5  #: Lateral errors beyond this leave the figure
 STAND_S = 3.0  #: Time of a stop
 
 START_M, SLOW_MPS = 2.0, 0.5
@@ -235,7 +233,7 @@ def drive_warnings(
 
 def report(result: PathResult) -> Report:
     """Return whether the path was followed, its lateral error, and behind it what the observer gave."""
-    degrees = 180.0 / math.pi
+    degrees, drive = 180.0 / math.pi, result.drive
     figures: list[tuple[Any, ...]] = [
         *result.pairs("length_m", "duration_s", "slowest_mps", "lateral_max_m", "lateral_rms_m"),
         ("true slip angle, largest", result.slip_max_rad * degrees, "", "°"),
@@ -250,7 +248,7 @@ def report(result: PathResult) -> Report:
         title=f"{result.robot} along {result.path.name}",
         answer=verdict(result),
         lead=f"{result.speed_mps:g} m/s · sideslip by: {result.observer} · seed {result.seed}",
-        picture=_lateral_figure(result),
+        picture=lateral_figure(drive.distance_m, drive.lateral_m - result.offset_m, result.limit_m),
         parts=[*(Text(text, "warning") for text in result.warnings), Pairs(figures)],
         details=[
             Section("Path and robot", list(_map(result))),
@@ -269,22 +267,6 @@ def verdict(result: PathResult) -> str:
         "The path was followed to its end; the lateral error is at most "
         f"{format_value(result.lateral_max_m, '.3f', 'm')} (at {result.lateral_max_at_m:.0f} m), {beside} a tenth "
         f"of the speed, {format_value(result.limit_m, '.3f', 'm')}."
-    )
-
-
-def _lateral_figure(result: PathResult) -> Figure:
-    drive = result.drive
-    error, ends = drive.lateral_m - result.offset_m, drive.distance_m[[0, -1]]
-    most = 1.1 * min(max(result.limit_m, float(np.abs(error).max())), SHOWN_M)
-    marks: list[Mark] = [
-        Band("a tenth of the speed", ends, [-result.limit_m] * 2, [result.limit_m] * 2, 6),
-        Line("lateral error", drive.distance_m, error, 0),
-    ]
-    return Figure(
-        "Lateral error along the path",
-        [Panel(marks, "lateral error [m]", y_range=(-most, most))],
-        "Of the true position, to the desired offset; positive to the left.",
-        x_label=DISTANCE,
     )
 
 

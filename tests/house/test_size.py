@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MAX_LINES = {"terrain": 57_200, "features": 2_680, "pipelines": 20_170, "tests": 51_500}
+MAX_LINES = {"terrain": 57_200, "features": 2_680, "pipelines": 20_150, "tests": 51_600}
 """Lines of Python, docstrings included."""
 
 

@@ -131,7 +131,7 @@
     const series = [{ label: panel.x_label || (last && figure.x_label) || "x", value: (u, v) => written(v) }];
     for (const mark of own) {
       const colour = colourOf(mark, mark.number), line = mark.kind === "line";
-      series.push({ label: mark.label || " ", stroke: colour, width: line ? 1.4 : 0, spanGaps: true, dash: mark.dashed ? [6, 4] : undefined,
+      series.push({ label: mark.label || " ", stroke: colour, width: line ? 1.4 : 0, dash: mark.dashed ? [6, 4] : undefined,
         points: { show: !line, size: 6, fill: colour }, paths: line ? undefined : () => null, value: (u, v) => written(v) });
     }
     for (const mark of drawn)

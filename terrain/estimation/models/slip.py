@@ -88,8 +88,9 @@ WHEEL_STD_MPS, GYRO_STD_RADPS, YAW_ACCEL = 0.01, 0.005, 1.0
 BIAS_STD_RADPS, BIAS_WALK = 0.005, 2e-4
 ACCEL_WALK, SHAKEN_RATIO, FREE_WALK = 0.05, 0.2, 1.0
 """Walk of the speed within a second beside an accelerometer, what 1 m/s^2 of vibration adds, and without one."""
-TILTED_STD, TILTED_WALK, UNTILTED_STD, UNTILTED_WALK = 0.15, 0.1, 0.6, 0.3
-"""Of the accelerometer's bias with a measured pitch, and without one, where it is the slope's gravity."""
+ACCEL_BIAS_STD, TILTED_WALK, UNTILTED_WALK = 0.6, 0.1, 0.3
+"""Of the accelerometer's bias at first, and its walk within a second with a measured pitch, and without one, where it
+is the slope's gravity."""
 POSE_STD_M, POSE_STD_RAD, COMPASS_STD_RAD, CAMERA_STD_MPS, GNSS_SPEED_STD_MPS = 0.02, 0.02, 0.05, 0.03, 0.03
 """Of measurements whose own deviation is not given; of poses at first."""
 LEAST_POSE_STD_M, LEAST_POSE_STD_RAD, N_POSES, POSES_FORGOTTEN = 5e-4, 5e-4, 20, 100
@@ -99,8 +100,8 @@ DELAY_S, DELAY_STD_S, KNOWN_STD_S = 0.07, 0.07, 0.02
 of one that a description has by logs."""
 ALIGNED_RAD, CRAB_RAD, LOST_RAD = 0.05, 0.05, 0.6
 """Deviation at which a heading by the motion is used; that of the motion from the heading; and one that is lost."""
-LEAST_TRAVEL_M, LEAST_RATIO = 0.5, 0.3
-"""Travel by the wheels that shows a heading, and how much of it the receiver has to see."""
+LEAST_TRAVEL_M = 0.5
+"""Least travel by the wheels that shows a heading."""
 DELAY_BOUNDS_S, SLIP_BOUNDS, LARGEST_BIAS_MPS2 = (-0.2, 0.8), (-3.0, 3.0), 3.0
 """Bounds of delay and of m, chi and d, far from what they are, which move the mean; and a bias beyond which an
 accelerometer is left out: its units or axes are others."""
@@ -116,7 +117,7 @@ LEAST_MPS, STANDING_MPS, VIBRATION_S, CHANGE_S, MEAN_S = 0.2, 0.01, 0.3, 0.15, 0
 """Least speed that shows a heading, that of wheels that stand; low-passes of vibration, of how the wheels' speeds
 change, and of what their slip is multiplied by."""
 N_JUDGED = 7
-"""Sensors beside the wheels, which are rejected where the ground or a sensor is to blame."""
+"""Number of sensors beside the wheels: the status tells what becomes of these alone."""
 MOST_MPS, MOST_RADPS, MOST_MPS2 = 60.0, 30.0, 100.0
 """More than wheels, gyro and accelerometer of a ground robot measure."""
 
@@ -248,6 +249,11 @@ class WheelRows(NamedTuple):
     across: Array  #: (k,) and of each steered one
     groups: tuple[int, ...]  #: slow state of each row
 
+    @property
+    def n_slow(self) -> int:
+        """Number of slow states."""
+        return 1 + max(self.groups)
+
 
 def rows_of_wheels(robot: Robot) -> WheelRows:
     """Return the rows of a robot's wheels.
@@ -269,7 +275,7 @@ class SlipFilter(FilterObserver):
 
     Parameters
     ----------
-    robot : of which ``ConfigError`` is raised where more than :data:`MOST_ROWS` rows describe its wheels
+    robot : with at most :data:`MOST_ROWS` rows of wheels, as every drive has
 
     Examples
     --------
@@ -292,7 +298,8 @@ class SlipFilter(FilterObserver):
     def __init__(self, robot: Robot) -> None:
         self._robot, self._wheels = robot, rows_of_wheels(robot)
         logged, _, groups = self._wheels
-        n_slow, n_rows, turns = 1 + max(groups), len(groups), robot.skids or isinstance(robot, BicycleRobot)
+        n_slow, n_rows = self._wheels.n_slow, len(groups)
+        turns = robot.skids or isinstance(robot, BicycleRobot)
         names = [robot.wheels[i] for i in logged.tolist()]
         slow = [f"ground_slip_{name}_ratio" for name in names] if n_slow > 1 else ["ground_slip_ratio"]
         self.states = (*_MOTION, *slow, *["turn_loss_ratio"] * turns)
@@ -332,7 +339,7 @@ class SlipFilter(FilterObserver):
             process_variance=np.zeros(len(self.states) + n_rows),
             measurement_variance=np.ones(MOST_ROWS + 1 + len(_REFERENCES)),
             initial_variance=np.square(
-                [1e-3, 1e-3, 1e-3, 1.0, 0.1, 0.5, BIAS_STD_RADPS, UNTILTED_STD, DELAY_STD_S, DELAY_STD_S]
+                [1e-3, 1e-3, 1e-3, 1.0, 0.1, 0.5, BIAS_STD_RADPS, ACCEL_BIAS_STD, DELAY_STD_S, DELAY_STD_S]
                 + [SLOW_RATIO] * n_slow
                 + [loss_std] * turns
                 + [FAST_RATIO] * n_rows
@@ -383,10 +390,10 @@ class SlipFilter(FilterObserver):
         if isinstance(self._robot, BicycleRobot):
             z[logged.size] += math.sin(float(np.nan_to_num(angles[0]))) * float(self.filter.mean[_VX])
         gyro = given["yaw_rate_radps"]
-        references = self._place(given, inputs)
-        z = np.concatenate([z, [gyro if abs(gyro) <= MOST_RADPS else np.nan], references])
         self._begin_delays(given)
         self._take_pose(given)
+        references = self._place(given, inputs)
+        z = np.concatenate([z, [gyro if abs(gyro) <= MOST_RADPS else np.nan], references])
         variance = self._variance(given, rates_mps2, dt_s)
         fix = self.advance(dt_s, z, inputs, self._walk(given, inputs, rates_mps2, dt_s), variance, N_JUDGED)
         mean = self.filter.mean
@@ -399,7 +406,7 @@ class SlipFilter(FilterObserver):
                 self.filter.model.initial_mean,
                 self.filter.model.initial_variance,
             )
-            self.filter.state["reference_age_s"] = math.inf
+            self.filter.state["reference_age_s"], self._has_delays = math.inf, ()
         if is_lost or (self._is_placed and self.filter.cov[_YAW, _YAW] > LOST_RAD**2):
             self._is_placed, self._seen, self._weight, self._first[:] = False, 0j, 0.0, np.nan
         return output
@@ -490,8 +497,7 @@ class SlipFilter(FilterObserver):
         """
         std = np.full(MOST_ROWS + 1 + len(_REFERENCES), self._scatter_mps)
         std[: rates_mps2.size] = np.hypot(self._scatter_mps, 0.29 * dt_s * rates_mps2)
-        unknown_mps2 = self._apart_mps2
-        late_mps = (given["gnss_age_s"] + float(self.filter.mean[_GNSS_DELAY])) * unknown_mps2
+        late_mps = (given["gnss_age_s"] + float(self.filter.mean[_GNSS_DELAY])) * self._apart_mps2
         fix_m = given["gnss_std_m"] if given["gnss_std_m"] > 0.0 else FLOAT_STD_M
         std[MOST_ROWS:] = (
             *(GYRO_STD_RADPS, fix_m, fix_m, *[math.hypot(GNSS_SPEED_STD_MPS, late_mps)] * 2),
@@ -503,7 +509,7 @@ class SlipFilter(FilterObserver):
     def _walk(self, given: Mapping[str, float], inputs: Array, rates_mps2: Array, dt_s: float) -> Array:
         """Return what the variance of each state grows by in a second, up to this tick."""
         n_rows, size = len(self._wheels.groups), float(inputs[_SIZE - _D])
-        n_slow = 1 + max(self._wheels.groups)
+        n_slow = self._wheels.n_slow
         dt_s, walk = max(dt_s, 1e-6), np.zeros(len(self.filter.model.states))
         has_accel, has_pitch = math.isfinite(inputs[_ACCEL - _D]), math.isfinite(given["pitch_rad"])
         shaken = SHAKEN_RATIO * math.sqrt(self._shaken_square)
@@ -613,7 +619,7 @@ class SlipFilter(FilterObserver):
         """Return the angle from the filter's own frame to the receiver's, and its deviation; infinite where unknown.
 
         By the travel since the first fix, and by the receiver's speeds; ``at`` and ``velocity`` are those of the
-        antenna in the filter's own frame.  A wheel that spins shows no heading: the receiver has to move as well.
+        antenna in the filter's own frame.  Wheels that spin show no heading: what has not moved scatters.
         """
         angle, std = math.nan, math.inf
         if not cmath.isnan(speed) and min(abs(speed), abs(velocity)) >= LEAST_MPS:
@@ -625,8 +631,7 @@ class SlipFilter(FilterObserver):
                 self._first[:] = fix, at
             seen, travelled = fix - complex(self._first[0]), at - complex(self._first[1])
             scatter = math.sqrt(2.0) * fix_std_m / max(abs(seen), 1e-9)
-            moved = abs(travelled) >= LEAST_TRAVEL_M and abs(seen) >= LEAST_RATIO * abs(travelled)
-            if moved and scatter < std:
+            if abs(travelled) >= LEAST_TRAVEL_M and scatter < std:
                 angle, std = cmath.phase(seen * travelled.conjugate()), scatter
         return angle, math.hypot(std, CRAB_RAD)
 
@@ -686,7 +691,7 @@ def _fading(variance: float, time_s: float, dt_s: float) -> float:
 def _lever(robot: Robot, section: str) -> tuple[float, float]:
     """Return where a sensor is mounted; the body's origin where the description does not say."""
     part = robot.parts.get(section)
-    return (0.0, 0.0) if part is None else (part.lever_x_m, part.lever_y_m)  # type: ignore[union-attr]
+    return getattr(part, "lever_x_m", 0.0), getattr(part, "lever_y_m", 0.0)
 
 
 def _identified(robot: Robot, *names: str) -> tuple[float, ...]:

@@ -1,6 +1,7 @@
 """The slip filter: its equations, headings by motion, delays, what is not observed, and simulated robots."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -166,6 +167,74 @@ def test_a_receiver_that_comes_after_a_camera_is_used_from_where_it_shows_the_he
     assert np.abs(track.slip[-200:] - 0.1).max() < 0.05
 
 
+def turning(n, left, right, loss, pushed_mps=0.0):
+    """Return stamps and rows of a robot that turns evenly from heading 0, and loses a part of its turn."""
+    time_s = PERIOD_S * np.arange(n)
+    rate = (right - left) * (1.0 - loss) / MINE.track_m
+    ahead = 0.5 * (left + right) + pushed_mps
+    path = ahead / rate * (np.exp(1j * rate * time_s) - 1.0) / 1j
+    seen = np.where(np.arange(n) % 5 == 0, 1.0, np.nan)
+    rows = {"speed_left_mps": np.full(n, left), "speed_right_mps": np.full(n, right)}
+    rows |= {"yaw_rate_radps": np.full(n, rate), "pose_x_m": path.real * seen, "pose_y_m": path.imag * seen}
+    return time_s, rows | {"pose_yaw_rad": wrapped(rate * time_s) * seen, "pose_age_s": np.zeros(n)}
+
+
+def test_what_is_lost_in_turning_is_learned_apart_from_slip_straight_ahead():
+    time_s, rows = turning(1000, -0.4, 0.4, 0.6, pushed_mps=0.08)  # one side slips more
+    _, track = run_filter(MINE, time_s, rows)
+    assert track.state("turn_loss_ratio")[-1] == pytest.approx(0.6, abs=0.1)
+    for side in ("left", "right"):
+        assert abs(track.state(f"ground_slip_{side}_ratio")[-1]) < 0.05
+    _, wide = run_filter(MINE, *turning(1000, 0.6, 0.8, 0.4))
+    assert wide.state("turn_loss_ratio")[-1] == pytest.approx(0.4, abs=0.25)
+
+
+def test_a_car_without_a_gyro_turns_as_its_wheel_is_steered():
+    time_s, rows, true = drive(CAR)
+    del rows["yaw_rate_radps"]
+    for name in ("gnss_x_m", "gnss_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps"):
+        rows[name] = np.where(time_s > 20.0, np.nan, rows[name])
+    _, track = run_filter(CAR, time_s, rows)
+    assert np.abs(track.state("yaw_rate_radps") - true["w"])[time_s > 20.0].max() < 0.05
+
+
+def test_gravity_of_a_slope_is_taken_off_by_the_measured_pitch():
+    time_s, rows, _ = drive(HUSKY)
+    rows["pitch_rad"] = np.full(len(time_s), -0.1)
+    rows["accel_x_mps2"] = rows["accel_x_mps2"] + 9.80665 * np.sin(0.1)
+    _, track = run_filter(HUSKY, time_s, rows)
+    assert abs(track.state("accel_bias_x_mps2")[-1]) < 0.1
+
+
+def test_slip_of_the_ground_is_never_less_known_than_before_the_first_motion():
+    time_s = 0.1 * np.arange(1500)
+    speed = np.where((time_s // 2.0) % 2 == 0, 0.8, -0.8)
+    rows = {"speed_left_mps": speed, "speed_right_mps": speed, "yaw_rate_radps": 0.0 * time_s}
+    _, track = run_filter(HUSKY, time_s, rows)
+    assert track.std[:, track.states.index("ground_slip_left_ratio")].max() < 1.3 * module.SLOW_RATIO
+
+
+def test_the_covariance_is_one_where_poses_come_after_a_camera():
+    time_s, rows, true = drive(MINE, n=400)
+    rows = {name: row for name, row in rows.items() if not name.startswith("gnss")}
+    rows |= {
+        "camera_x_mps": rng_speeds(true["vx"]),
+        "camera_y_mps": 0.0 * time_s,
+        "camera_age_s": 0.0 * time_s,
+    }
+    poses = {
+        "pose_x_m": true["x"],
+        "pose_y_m": 0.0 * time_s,
+        "pose_yaw_rad": true["yaw"],
+        "pose_age_s": 0.0 * time_s,
+    }
+    late = time_s >= 4.0 - 1e-9
+    rows |= {name: np.where(late, row, np.nan) for name, row in poses.items()}
+    first = int(np.argmax(late))
+    filter_, _ = run_filter(MINE, time_s[: first + 1], {name: row[: first + 1] for name, row in rows.items()})
+    assert np.linalg.eigvalsh(filter_.filter.cov)[0] > 0.0
+
+
 def rng_speeds(speed_mps):
     return speed_mps + 0.03 * np.random.default_rng(8).standard_normal(len(speed_mps))
 
@@ -206,6 +275,43 @@ def test_over_ten_seconds_without_a_reference_slip_of_the_ground_is_remembered_w
     assert track.slip_std[after].min() > 1.5 * track.slip_std[before].max()
     assert track.status[after] == ObserverStatus.PREDICTED
     assert filter_.reference_age_s == pytest.approx(time_s[-1] - 18.0, abs=0.2)
+
+
+def test_the_ripple_of_a_wheels_speed_is_no_slip_that_grows_without_a_reference():
+    time_s, rows, _ = drive(MINE, n=2500)
+    rng = np.random.default_rng(4)
+    for name in rows:
+        if name.startswith("speed_"):
+            rows[name] = rows[name] + 0.01 * rng.standard_normal(len(time_s))
+        if name.startswith(("gnss_x", "gnss_y", "gnss_speed")):
+            rows[name] = np.where(time_s > 20.0, np.nan, rows[name])
+    rows["accel_x_mps2"] = rows["accel_x_mps2"] + 0.3 * rng.standard_normal(len(time_s))
+    _, track = run_filter(MINE, time_s, rows)
+    before, after = np.searchsorted(time_s, [20.0, 49.0])
+    for side in ("left", "right"):
+        ground = track.state(f"ground_slip_{side}_ratio")
+        assert (
+            abs(ground[after] - ground[before])
+            < track.std[after, track.states.index(f"ground_slip_{side}_ratio")]
+        )
+
+
+def test_a_delay_that_a_description_has_is_there_from_the_first_pose_on():
+    late = replace(MINE, identified={"pose_delay_s": 0.4})
+    time_s, rows, truth = drive(late, n=200)
+    poses = {
+        "pose_x_m": truth["x"],
+        "pose_y_m": 0.0 * time_s,
+        "pose_yaw_rad": truth["yaw"],
+        "pose_age_s": 0.0 * time_s,
+    }
+    rows = {name: row for name, row in rows.items() if not name.startswith("gnss")} | poses
+    rows |= {name: np.where(time_s < 1.0, np.nan, row) for name, row in poses.items()}
+    _, track = run_filter(late, time_s, rows)
+    first = np.searchsorted(time_s, 1.0 - 1e-9)
+    moved_m = track.state("position_x_m")[first] - poses["pose_x_m"][first]
+    assert track.state("pose_delay_s")[first] == pytest.approx(0.4, abs=0.02)
+    assert moved_m == pytest.approx(0.4 * track.state("speed_x_mps")[first], abs=0.05)
 
 
 def test_an_accelerometer_in_other_units_is_left_out():
@@ -295,5 +401,6 @@ def test_mean_slip_of_a_skid_steer_robot_with_a_receiver_is_within_a_hundredth(s
     assert 0.90 < np.mean(inside) <= 0.995
 
 
-def test_constants_that_docs_name_are_there():
-    assert module.UNKNOWN_RATIO == 0.25
+def test_the_guide_states_from_where_on_slip_is_unknown():
+    guide = (Path(__file__).parents[4] / "docs" / "guide.md").read_text(encoding="utf-8")
+    assert f"standard deviation is above {module.UNKNOWN_RATIO:g}" in guide
