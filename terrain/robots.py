@@ -36,7 +36,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -45,6 +45,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn, Self, Typ
 
 import numpy as np
 
+from terrain.constants import GRAVITY_MPS2
 from terrain.deviation import Deviation, read_deviation
 from terrain.effects import read_effects
 from terrain.errors import ConfigError
@@ -390,6 +391,8 @@ class Robot(ABC):
 
     #: numbers that every description of the drive has, beside its sections
     numbers: ClassVar[tuple[str, ...]] = ("wheel_radius_m", "track_m", "wheelbase_m", "mass_kg")
+    #: what is assumed, from the numbers before it, of one that a description may leave out
+    presumed: ClassVar[Mapping[str, Callable[[Mapping[str, float]], float]]] = MappingProxyType({})
     #: what its descriptions have in place of a number here, and by what that is multiplied
     spelled: ClassVar[Mapping[str, tuple[str, float]]] = MappingProxyType({})
     drive: ClassVar[str]  #: the kind of drive, as descriptions name it
@@ -574,6 +577,9 @@ class TrackedRobot(SkidSteerRobot):
     numbers: ClassVar[tuple[str, ...]] = (
         *("sprocket_radius_m", "track_m", "contact_length_m", "track_width_m", "com_height_m", "mass_kg"),
     )
+    presumed = MappingProxyType(
+        {"com_height_m": lambda own: own["sprocket_radius_m"] + 0.1 * own["contact_length_m"]}
+    )
     spelled = MappingProxyType(
         {"wheel_radius_m": ("sprocket_radius_m", 1.0), "wheelbase_m": ("contact_length_m", 1.0)}
     )
@@ -713,6 +719,7 @@ class MecanumRobot(Robot):
     roller_rad: float = math.pi / 4
 
     numbers: ClassVar[tuple[str, ...]] = (*Robot.numbers, "roller_rad")
+    presumed = MappingProxyType({"roller_rad": lambda own: math.pi / 4})
     drive: ClassVar[str] = "mecanum"
     n_tyres: ClassVar[int] = 4
 
@@ -766,6 +773,26 @@ class BicycleRobot(Robot):
         *Robot.numbers,
         *["com_ahead_m", "com_height_m", "yaw_inertia_kgm2", "steering_max_rad", "steering_time_constant_s"],
         *["steering_rate_radps", "speed_max_mps", "front_cornering_npr", "rear_cornering_npr"],
+    )
+    # the box of the wheels; tyres that turn a load aside by 8 times itself a radian, as soft ones on firm soil
+    presumed = MappingProxyType(
+        {
+            "com_ahead_m": lambda own: own["wheelbase_m"] / 2.0,
+            "com_height_m": lambda own: own["wheel_radius_m"] + 0.1 * own["wheelbase_m"],
+            "yaw_inertia_kgm2": lambda own: (
+                own["mass_kg"]
+                * ((own["wheelbase_m"] + 2.0 * own["wheel_radius_m"]) ** 2 + own["track_m"] ** 2)
+                / 12.0
+            ),
+            "steering_time_constant_s": lambda own: 0.1,
+            "steering_rate_radps": lambda own: 1.0,
+            "front_cornering_npr": lambda own: (
+                8.0 * GRAVITY_MPS2 * own["mass_kg"] * own["com_ahead_m"] / own["wheelbase_m"]
+            ),
+            "rear_cornering_npr": lambda own: (
+                8.0 * GRAVITY_MPS2 * own["mass_kg"] * (1.0 - own["com_ahead_m"] / own["wheelbase_m"])
+            ),
+        }
     )
     drive: ClassVar[str] = "bicycle"
     sections: ClassVar[tuple[str, ...]] = ("sensors",)
@@ -969,15 +996,19 @@ def robot_from(file: str, described: Any) -> Robot:
     drive = described.get("drive") if isinstance(described, dict) else None
     kind = KIND_OF_DRIVE.get(drive, SkidSteerRobot) if isinstance(drive, str) else SkidSteerRobot
     others = (*KIND_OF_SECTION, "identified", "filters", "effects", "learned", "deviation", "watch")
-    check_keys(file, described, ["name", "drive", *kind.numbers], optional=others)
+    required = [key for key in kind.numbers if key not in kind.presumed]
+    check_keys(file, described, ["name", "drive", *required], optional=(*kind.presumed, *others))
     name = described["name"]
     if not isinstance(name, str) or not name:
         raise ConfigError(f"{file}: name is {shown(name)}, a word is required")
     check_name(f"{file}: name", name, ConfigError)
     if not isinstance(drive, str) or drive not in KIND_OF_DRIVE:
         raise ConfigError(f"{file}: drive {shown(drive)} is unknown: use one of {', '.join(KIND_OF_DRIVE)}")
-    entries = {key: described[key] for key in kind.numbers}
-    own, parts = numbers(file, entries, dict.fromkeys(kind.numbers)), {}
+    entries = {key: described[key] for key in kind.numbers if key in described}
+    own, parts = numbers(file, entries, dict.fromkeys(entries)), {}
+    for key, presume in kind.presumed.items():
+        if key not in own:
+            own[key], entries[key] = presume(own), {"source": "assumed"}
     for section, part in KIND_OF_SECTION.items():
         if described.get(section) is not None:
             place, lows = f"{file}: {section}", {item.name: LEAST[item.type] for item in fields(part)}

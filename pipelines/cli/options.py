@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import types
 import typing
+from collections.abc import Mapping
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
 import click
 
-from pipelines.cli.table import Command
+from pipelines.cli.table import COMMANDS, Command
 from pipelines.report.results import Result, write_json
 from pipelines.report.settings import ENDINGS, Settings, check_file, setting
 
@@ -62,6 +64,7 @@ class OneFile(click.Command):
         with progress_bar() as progress:
             result: Result = self.module.run(settings, progress)
         report = result.report
+        report = replace(report, next_step=next_command(report.next_step, given))
         print_report(report, details=output.details)
         if output.json_file is not None:
             write_json(output.json_file, result)
@@ -77,6 +80,38 @@ class OneFile(click.Command):
         for heading, rows in (described_options(self.module.Settings) | described_options(Output)).items():
             with formatter.section(heading):
                 formatter.write_dl(rows)
+
+
+def next_command(step: str, given: Mapping[str, Any]) -> str:
+    """Return a command line that a report names as the next, with what this command was given and the next one takes.
+
+    ``DIR`` in it stands for the data of this command, which come with their mapping and format.  The robot is that of
+    this command, unless the line names another one's file.
+
+    Examples
+    --------
+    >>> next_command("terrain estimate --data DIR --out runs/", {"data": "raw/", "robot": "mine.yaml"})
+    'terrain estimate --data raw/ --out runs/ --robot mine.yaml'
+    """
+    words = step.split()
+    module = next((each.module for each in COMMANDS if words[:2] == ["terrain", each.name]), None)
+    if module is None:
+        return step
+    fields = {field.alias for field in import_module(module).Settings.model_fields.values()}
+    if "DIR" in words and given.get("data"):
+        words[words.index("DIR")] = str(given["data"])
+        for name, option in (("layout", "--format"), ("mapping", "--mapping")):
+            if given.get(name) and option in fields:
+                words += [option, str(given[name])]
+    if given.get("robot") and "--robot" in fields:
+        from terrain.robots import load_robot, robot_argument
+
+        file = str(given["robot"])
+        if "--robot" not in words:
+            words += ["--robot", file]
+        elif words[words.index("--robot") + 1] in ("ROBOT", robot_argument(load_robot(file).name)):
+            words[words.index("--robot") + 1] = file
+    return " ".join(words)
 
 
 def described_options(model: type[Settings]) -> dict[str, list[tuple[str, str]]]:

@@ -58,6 +58,7 @@ class Inspection(Result):
     skipped: tuple[str, ...] = described("a sentence for each run that could not be read")
     runs: tuple[InspectedRun, ...] = described("streams, clock, odd stretches and checks of each run")
     duplicates: tuple[SharedStretch, ...] = described("stretches that two runs share", default=())
+    converted: bool = described("whether they are run folders already", default=False)
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a row a stream."""
@@ -87,7 +88,7 @@ def run(settings: Settings, progress: Progress = silent) -> Inspection:
     from terrain.logs.clock import estimate_clock
     from terrain.logs.duplicates import shared_stretches
     from terrain.logs.plausibility import stream_quality
-    from terrain.logs.run_folders import data_digest
+    from terrain.logs.run_folders import data_digest, run_folders
     from terrain.robots import robot_named
 
     runs, skipped, _, verdicts = read(settings, refuse=False)
@@ -102,7 +103,9 @@ def run(settings: Settings, progress: Progress = silent) -> Inspection:
         about = each.run_id, each.terrains, dict(each.dropped), streams, clock
         inspected.append(InspectedRun(*about, odd_stretches(each), verdicts[each.run_id]))
         progress("inspect", done, len(runs))
-    return Inspection(len(runs), data_digest(runs), tuple(skipped), tuple(inspected), shared_stretches(runs))
+    converted = settings.data.is_dir() and bool(run_folders(settings.data))
+    found = len(runs), data_digest(runs), tuple(skipped), tuple(inspected)
+    return Inspection(*found, shared_stretches(runs), converted)
 
 
 def report(result: Inspection) -> Report:
@@ -137,7 +140,9 @@ def report(result: Inspection) -> Report:
             ("Clock of the wheels against the IMU", [Table(("run", Column("clock", long=True)), clocks)]),
             ("Dropped", dropped),
         ),
-        next_step="terrain convert FOLDER --out runs/",
+        next_step="terrain estimate --data DIR --out runs/"
+        if result.converted
+        else "terrain convert DIR --out raw/",
     )
 
 

@@ -75,7 +75,7 @@ def estimate_all(
 
 SLIPS = (
     Column("run", of="run.run_id", long=True),
-    Column("slip", of="name"),
+    Column("slip", of=lambda row: _words(row["name"]) or row["name"]),
     Column("mean", SLIP, of="slip.mean"),
     Column("std", ".4f", of="slip.std"),
     Column("true", SLIP, of="slip.true_mean"),
@@ -101,9 +101,9 @@ def report(result: ObserverResult) -> Report:
         statuses.append(f"{run.run_id}: {times}{dropped}{missing}{why}")
     return tracks_report(
         result,
-        f"Slip by the observer {result.filter}",
+        f"Estimates by '{result.filter}'",
         _answer(result),
-        (rows, SLIPS, f"observer {result.filter}"),
+        (rows, SLIPS, "slip by run"),
         ("Statuses", statuses),
     )
 
@@ -115,7 +115,9 @@ def _answer(result: ObserverResult) -> str:
         for name, slip in row.slip.items():
             means.setdefault(name, []).extend([slip.mean] if math.isfinite(slip.mean) else [])
     known = [
-        f"{name} is {format_value((min(each), max(each)), SLIP)}" for name, each in means.items() if each
+        f"{_words(name)} is {format_value((min(each), max(each)) if len(each) > 1 else each[0], SLIP)}"
+        for name, each in means.items()
+        if each
     ]
     if known:
         return f"In the means of {n}, {enumerated(known)}."
@@ -147,11 +149,11 @@ def slip_figure(found: ObserverEstimate) -> Figure:
     for k, name in enumerate(track.slips):
         scale, unit = (np.degrees(1.0), "degrees") if name.endswith("_rad") else (1.0, "ratio")
         slip, std, true = scale * track.slip[:, k], scale * track.slip_std[:, k], found.true(name)
-        marks = estimated(found.observer.name, time_s, slip, std, 1, None if true is None else scale * true)
-        label = f"{name.rpartition('_')[0].replace('_', ' ')} [{unit}]"
+        marks = estimated("estimate", time_s, slip, std, 1, None if true is None else scale * true)
+        label = f"{_words(name)} [{unit}]"
         panels.append(Panel([*marks, strip], label, y_range=_range(time_s, slip)))
-    title = f"Slip of {found.run.run_id} by the observer {found.observer.name}"
-    return Figure(title, panels, "With one standard deviation.", x_label="time [s]")
+    caption = f"Estimated by '{found.observer.name}', with one standard deviation."
+    return Figure(f"Slip of {found.run.run_id}", panels, caption, x_label="time [s]")
 
 
 def path_figure(found: ObserverEstimate) -> Figure:
@@ -162,11 +164,17 @@ def path_figure(found: ObserverEstimate) -> Figure:
         gnss = found.run.streams["gnss"]
         fixes = gnss.channel("position_x_m"), gnss.channel("position_y_m")
         marks.append(Points("fixes", *fixes, colour=4))
-    marks.append(Line(found.observer.name, own.real, own.imag, 0))
+    marks.append(Line("estimate", own.real, own.imag, 0))
     if true is not None:
         marks.append(Line("truth", true.real, true.imag, TRUTH_COLOUR, dashed=True))
-    title = f"Path of {found.run.run_id} by the observer {found.observer.name}"
-    return Figure(title, (Panel(marks, "y [m]", equal=True),), x_label="x [m]")
+    caption = f"Estimated by '{found.observer.name}'."
+    panel = Panel(marks, "y [m]", equal=True)
+    return Figure(f"Path of {found.run.run_id}", (panel,), caption, x_label="x [m]")
+
+
+def _words(channel: str) -> str:
+    """Return a channel as a reader writes it: ``slip left`` of ``slip_left_ratio``."""
+    return channel.rpartition("_")[0].replace("_", " ")
 
 
 def _range(time_s: Array, slip: Array) -> tuple[float, float] | None:

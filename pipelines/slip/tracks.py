@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 from pipelines.report.figure import Band, Figure, Line, Mark
 from pipelines.report.results import Progress, Result, described
-from pipelines.report.tree import Column, Part, Report, sections
+from pipelines.report.tree import Column, Part, Report, sections, value_at
 from pipelines.slip.shown import first_rows
 from terrain.records import Array, RunLog
 
@@ -73,10 +73,12 @@ def tracks_report(
     ----------
     result : with its ``filter``, ``out``, ``pictures`` and ``skipped``
     title, answer, parts : of the report, ``parts`` after its table
-    rows : of its table, with its columns and its title
+    rows : of its table, with its columns, of which those of a truth that no run has are left out, and its title
     texts : a section of the details
     """
-    pictures, (first, all_rows) = dict(result.pictures), first_rows(*rows)
+    records, columns, heading = rows
+    columns = [each for each in columns if any(_known(value_at(row, each.of or 0)) for row in records)]
+    pictures, (first, all_rows) = dict(result.pictures), first_rows(records, columns, heading)
     lead = next((name for name in pictures if name.endswith("_slip")), next(iter(pictures), ""))
     writing = f"terrain estimate --data DIR --filter {result.filter} --out runs/"
     return Report(
@@ -87,6 +89,11 @@ def tracks_report(
         sections(all_rows, texts, ("Pictures", list(pictures.values())), ("Not read", result.skipped)),
         writing if result.out is None else f"terrain crossval --data {result.out}",
     )
+
+
+def _known(value: Any) -> bool:
+    """Return whether a cell says anything."""
+    return value is not None and value == value  # NaN is not itself
 
 
 def estimated(

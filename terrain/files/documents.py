@@ -74,9 +74,9 @@ def check_keys(place: str, entry: Any, desired: list[str], optional: tuple[str, 
     for key in entry:
         if key not in accepted:
             raise ConfigError(f"{place}: key {shown(str(key))} is unknown (accepted: {', '.join(accepted)})")
-    for key in desired:
-        if key not in entry:
-            raise ConfigError(f"{place}: key {key!r} is missing")
+    if missing := [repr(key) for key in desired if key not in entry]:
+        are = "key {} is" if len(missing) == 1 else "keys {} are"
+        raise ConfigError(f"{place}: {are.format(', '.join(missing))} missing")
 
 
 MAX_JSON_BYTES = 16 * MEBIBYTE  #: A run with a label each second of 24 hours has 7 MiB of them

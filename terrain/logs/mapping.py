@@ -8,8 +8,10 @@ that all topics have, by their stamps; ``previous`` the instants of the stream's
 others by then.  What is wrong with messages is refused at once, or counted where it is repaired (:class:`Faults`).
 
 Of tables a word in braces stands for any text without a slash, and the files of which all such words agree make one
-run; every stream has the same words.  Several streams may name one file, and the files of a run may be of different
-formats, bags too; ``offset`` brings their times onto one clock.  ``position`` becomes the channels
+run; every stream has the same words.  Several streams may name one file, whose rows without any value of a stream are
+those of other sensors; the files of a run may be of different formats, bags too; ``offset`` brings their times onto one
+clock.  Times that begin later than an hour are those of a clock, and are counted from the first of the run.
+``position`` becomes the channels
 :data:`POSITION_CHANNELS`.  A channel with ``rate`` is the rate of the number there, as of an encoder's
 counts or position; a counter begins anew after ``wraps`` of them (:mod:`terrain.logs.counters`).
 
@@ -26,6 +28,7 @@ import glob
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -64,6 +67,9 @@ from terrain.logs.tables import MAX_VALUES, TextLayout, read_table, row_number
 from terrain.records import Array, Label, RunLog, Stream
 
 MAX_HEADER_ROWS = 1000  #: No instrument writes a longer head
+LATEST_START_S = (
+    3600.0  #: No log counted from its own start begins later; a clock's does (1970, GPS week, boot)
+)
 
 POSITION_CHANNELS = ("position_x_m", "position_y_m", "position_z_m")
 """What latitude, longitude and height become: east, north and up of an origin."""
@@ -426,6 +432,7 @@ def read_run(
     repairs = dropped if repair else None
     streams: dict[str, Stream] = {}
     names = []
+    shared = Counter(stream.file for stream in mapping.streams.values())
     for name, stream in mapping.streams.items():
         path = folder / places.get(name, stream.file.format(**words))
         check_log_file(path, path.parent if linked_folders else folder)
@@ -447,6 +454,10 @@ def read_run(
         layout = TextLayout(stream.delimiter, stream.decimal, stream.skip_rows, stream.header_rows)
         columns = [normal_name(each) for each in (*(source.column for source in sources), *placed)]
         table = read_table(path, columns, layout=layout, sheet=stream.sheet, repairs=repairs).T
+        own_rows = np.arange(table.shape[1])
+        if shared[stream.file] > 1 and np.isfinite(table[1:]).any():
+            own_rows = np.flatnonzero(np.isfinite(table[1:]).any(axis=0))
+            table = table[:, own_rows]
         time_s, *values = (source.si(row, source.unit) for row, source in zip(table, sources, strict=False))
         values = [
             count_rates(time_s, value) if source.rate else value
@@ -471,10 +482,12 @@ def read_run(
             time_s,
             np.column_stack(values),
             channels,
-            row_of=partial(row_number, path, layout=layout),
+            row_of=partial(_row_of, path, own_rows, layout),
             columns=of,
             repairs=repairs,
         )
+    if (start_s := min(each.time_s[0] for each in streams.values())) > LATEST_START_S:
+        streams = {name: replace(each, time_s=each.time_s - start_s) for name, each in streams.items()}
     run_id = (mapping.run_id or "_".join(f"{{{word}}}" for word in words)).format(**words)
     refuse_apart(run_id, streams)
     terrain = mapping.terrain.format(**words)
@@ -482,6 +495,11 @@ def read_run(
     source = f"{' and '.join(dict.fromkeys(names))}, {by}"
     run = RunLog(run_id, mapping.robot, streams, labels, source, dropped)
     return checked_names(f"run {shown(run_id)}", run)
+
+
+def _row_of(path: Path, rows: Array, layout: TextLayout, index: int) -> int:
+    """Return the row of a file in which a sample is, of those that a stream has."""
+    return row_number(path, int(rows[index]), layout=layout)
 
 
 def _positions(position: Position, columns: Mapping[str, Array]) -> dict[str, tuple[Array, str]]:

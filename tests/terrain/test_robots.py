@@ -196,6 +196,34 @@ def test_sizes_of_vehicles_that_are_built_and_what_is_assumed_of_them_belong_tog
     with_assumed(robot).check_geometry("robot")
 
 
+def test_a_car_is_described_by_six_numbers_and_lists_what_is_missing_at_once(tmp_path):
+    file = data_folder("robots") / "adap2e.yaml"
+    keys = [
+        "name",
+        "drive",
+        "wheel_radius_m",
+        "track_m",
+        "wheelbase_m",
+        "mass_kg",
+        "steering_max_rad",
+        "speed_max_mps",
+    ]
+    full = yaml.safe_load(file.read_text())
+    path = tmp_path / "car.yaml"
+    path.write_text(yaml.safe_dump({key: full[key] for key in keys}))
+    car, described = load_robot(path), load_robot(file)
+    for key in set(type(car).presumed):
+        assert getattr(car, key) == pytest.approx(getattr(described, key), rel=0.5)
+        assert key in car.assumed
+    # half of the weight on each axle, a car turns as its geometry says
+    assert car.understeer_s2pm == pytest.approx(0.0, abs=1e-12)
+    path.write_text(yaml.safe_dump({"name": "car", "drive": "bicycle", "mass_kg": full["mass_kg"]}))
+    with pytest.raises(
+        ConfigError, match=r"keys 'wheel_radius_m', 'track_m', .* 'speed_max_mps' are missing"
+    ):
+        load_robot(path)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -7,12 +7,14 @@ from typing import Literal
 import pytest
 
 from pipelines.cli import main as cli
+from pipelines.cli.options import next_command
 from pipelines.cli.table import COMMANDS, FORMER, Command
 from pipelines.report.results import Result, described
 from pipelines.report.settings import Names, setting
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.tree import Report, Section, Text
 from terrain.errors import ConfigError, DataError
+from terrain.files.names import data_folder
 
 EXAMPLE = "terrain draw --folder a"
 
@@ -112,6 +114,27 @@ def test_json_and_page_are_written_and_details_are_asked_for(draw, tmp_path):
     assert json.loads((tmp_path / "new" / "a.json").read_text()) == {"ratio": None, "folder": "a"}
     assert "<summary>More</summary>" in (tmp_path / "a.html").read_text()
     assert "all of it" in draw("--folder", "a", "--details")[1]
+
+
+def test_the_next_command_is_given_the_data_the_mapping_and_the_robot_that_it_takes(tmp_path):
+    robot = tmp_path / "mine.yaml"
+    robot.write_text((data_folder("robots") / "husky.yaml").read_text())
+    given = {"data": "logs", "mapping": "map.yaml", "robot": str(robot)}
+    for step, next_step in (
+        (
+            "terrain convert DIR --out raw/",
+            f"terrain convert logs --out raw/ --mapping map.yaml --robot {robot}",
+        ),
+        ("terrain estimate --data raw", f"terrain estimate --data raw --robot {robot}"),
+        ("terrain drive --robot husky --table t", f"terrain drive --robot {robot} --table t"),
+        (
+            "terrain estimate --data DIR --robot new.yaml",
+            "terrain estimate --data logs --robot new.yaml --mapping map.yaml",
+        ),
+        ("record more runs", "record more runs"),
+    ):
+        assert next_command(step, given) == next_step
+        assert next_command(step, {}) == step
 
 
 def test_a_former_command_names_its_successor(terrain):

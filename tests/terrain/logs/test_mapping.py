@@ -105,6 +105,26 @@ def test_headers_delimiters_and_decimals_of_instruments_are_read(read, monkeypat
     assert stream.channel("speed_left_mps").tolist() == [1.5, 2.5]
 
 
+def test_rows_of_other_sensors_in_a_merged_file_are_no_samples_and_a_clock_is_counted_from_the_start(
+    tmp_path, read
+):
+    text = "t,v,wz,ax\n0,1.0,,\n0.01,,0.1,\n0.01,2.0,,\n0.02,,,0.5\n0.02,3.0,,\n"
+    imu = {
+        "gyro_z_radps": {"column": "wz", "unit": "rad/s"},
+        "accel_x_mps2": {"column": "ax", "unit": "m/s^2"},
+    }
+    for start_s in (0.0, 1.7e9):
+        time = {"column": "t", "unit": "s", "offset": start_s}
+        shared = {"file": "merged.csv", "time": time}
+        (tmp_path / "merged.csv").write_text(text)
+        run = read(streams={"wheels": {**shared, "channels": SPEED}, "imu": {**shared, "channels": imu}})
+        assert run.streams["wheels"].time_s == pytest.approx([0.0, 0.01, 0.02], abs=1e-6)
+        assert run.streams["wheels"].channel("speed_left_mps").tolist() == [1.0, 2.0, 3.0]
+        assert run.streams["imu"].time_s == pytest.approx([0.01, 0.02], abs=1e-6)
+        assert run.streams["imu"].channel("accel_x_mps2") == pytest.approx([np.nan, 0.5], nan_ok=True)
+        assert run.labels[0].start_s == 0.0
+
+
 COMMA = {"delimiter": ";", "decimal": ","}
 
 
