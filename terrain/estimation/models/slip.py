@@ -76,15 +76,20 @@ YIELDING_RATIO = 0.3
 and a gear have slack; d is then of the order of 1."""
 SLOW_RATIO, SLOW_WALK = 0.2, 0.02
 """Of m at first, about 0, and its walk within a second of driving."""
-TURN_WALK, DIRECTION_RATIO = 0.02, 0.1
-"""Walk of chi within a second of turning, and deviation of m where the wheels begin to turn otherwise, in reverse or
-about a tighter turn, by a radian in the space of their speeds."""
+TURN_WALK, GYRO_TURN_WALK, DIRECTION_RATIO = 0.02, 0.1, 0.1
+"""Walk of chi within a second of turning, and that of a robot that skids beside a gyro, whose bias wheels that slip
+would pull; and deviation of m where the wheels begin to turn otherwise, in reverse or about a tighter turn, by a radian
+in the space of their speeds."""
 SLOPE_RATIO2, SLOPE_S = 0.1, 1.0
 """Variance of m for a slope that changes by 1: a tenth of slope is a deviation of a tenth, as on loam; its low-pass."""
 ACROSS_RATIO, ACROSS_M = 0.03, 0.05
 """Sideways speed over the speed of the wheels, and over the yaw rate: of a robot that skids, and in turns."""
-WHEEL_STD_MPS, GYRO_STD_RADPS, YAW_ACCEL = 0.01, 0.005, 1.0
-"""Of a wheel's speed and a gyro's rate; walk of the yaw rate within a second."""
+WHEEL_STD_MPS, REST_STD_MPS, GYRO_STD_RADPS, YAW_ACCEL = 0.01, 0.001, 0.005, 1.0
+"""Of a wheel's speed, of the ground's below wheels that stand, and of a gyro's rate; walk of the yaw rate within a
+second."""
+APART_STDS = 2.0
+"""Deviation of the sides of a robot that skids, over what they differ by from the gyro: a robot that begins to turn
+follows its wheels late, and by wheels that spin the gyro's bias would run off."""
 BIAS_STD_RADPS, BIAS_WALK = 0.005, 2e-4
 ACCEL_WALK, SHAKEN_RATIO, FREE_WALK = 0.05, 0.2, 1.0
 """Walk of the speed within a second beside an accelerometer, what 1 m/s^2 of vibration adds, and without one."""
@@ -394,7 +399,7 @@ class SlipFilter(FilterObserver):
         self._take_pose(given)
         references = self._place(given, inputs)
         z = np.concatenate([z, [gyro if abs(gyro) <= MOST_RADPS else np.nan], references])
-        variance = self._variance(given, rates_mps2, dt_s)
+        variance = self._variance(given, rates_mps2, float(inputs[_SIZE - _D]), dt_s)
         fix = self.advance(dt_s, z, inputs, self._walk(given, inputs, rates_mps2, dt_s), variance, N_JUDGED)
         mean = self.filter.mean
         np.clip(mean[_GNSS_DELAY:], *self._bounds.T, out=mean[_GNSS_DELAY:])
@@ -489,7 +494,7 @@ class SlipFilter(FilterObserver):
         self._apart_mps2 = 0.5 * abs(measured - by_wheels)
         return both
 
-    def _variance(self, given: Mapping[str, float], rates_mps2: Array, dt_s: float) -> Array:
+    def _variance(self, given: Mapping[str, float], rates_mps2: Array, size_mps: float, dt_s: float) -> Array:
         """Return the variance of each measurement.
 
         A wheel's speed is a mean over a tick, half of one late.  A measured speed is of an age ago; what it has changed
@@ -497,6 +502,14 @@ class SlipFilter(FilterObserver):
         """
         std = np.full(MOST_ROWS + 1 + len(_REFERENCES), self._scatter_mps)
         std[: rates_mps2.size] = np.hypot(self._scatter_mps, 0.29 * dt_s * rates_mps2)
+        if size_mps < STANDING_MPS:
+            std[:MOST_ROWS] = REST_STD_MPS
+        if self._robot.skids:
+            left, right = (given[name] for name in self._speeds)
+            rolls = 1.0 - float(self.filter.mean[_SLOW + self._wheels.n_slow])
+            turn_radps = given["yaw_rate_radps"] - float(self.filter.mean[_GYRO_BIAS])
+            apart_mps = 0.5 * abs((right - left) * rolls - turn_radps * self._robot.track_m)
+            std[:2] = np.hypot(std[:2], APART_STDS * np.nan_to_num(apart_mps))
         late_mps = (given["gnss_age_s"] + float(self.filter.mean[_GNSS_DELAY])) * self._apart_mps2
         fix_m = given["gnss_std_m"] if given["gnss_std_m"] > 0.0 else FLOAT_STD_M
         std[MOST_ROWS:] = (
@@ -531,7 +544,9 @@ class SlipFilter(FilterObserver):
             known = self.filter.cov.diagonal()[_SLOW : _SLOW + n_slow] < SLOW_RATIO**2
             walk[_SLOW : _SLOW + n_slow] = np.where(known, SLOW_WALK**2 + changed / dt_s, 0.0)
             self._pulls, self._asked = pulls, asked
-            walk[_SLOW + n_slow : len(self.states)] = (TURN_WALK * tight) ** 2
+            by_gyro = self._robot.skids and math.isfinite(given["yaw_rate_radps"])
+            turn_walk = GYRO_TURN_WALK if by_gyro else TURN_WALK
+            walk[_SLOW + n_slow : len(self.states)] = (turn_walk * tight) ** 2
         self._rolled_m = self._rolled_m + size * dt_s if size > STANDING_MPS else 0.0
         yields = math.exp(-self._rolled_m / (YIELDING_RATIO * self._robot.wheel_radius_m))
         fast = FAST_RATIO + FAST_PER_MPS2 * float(np.abs(rates_mps2).max()) + FAST_TURNING * tight + yields

@@ -198,6 +198,25 @@ def test_a_car_without_a_gyro_turns_as_its_wheel_is_steered():
     assert np.abs(track.state("yaw_rate_radps") - true["w"])[time_s > 20.0].max() < 0.05
 
 
+@pytest.mark.parametrize("bias_radps", [-0.004, 0.006])
+@pytest.mark.parametrize("difference_mps", [0.0, 0.11, 0.3, -0.39])
+def test_the_bias_of_a_gyro_is_that_at_rest_and_wheels_that_spin_leave_it_alone(bias_radps, difference_mps):
+    """Two seconds of rest, then wheels that turn on the spot on a robot that stays where it is."""
+    rng, time_s = np.random.default_rng(3), PERIOD_S * np.arange(1500)
+    spin = np.where(time_s > 2.0, 0.5 * difference_mps, 0.0)
+    noise = rng.normal(0.0, 0.01, (2, len(time_s))) * (spin != 0.0)
+    rows = {"speed_left_mps": noise[0] - spin, "speed_right_mps": noise[1] + spin}
+    rows["yaw_rate_radps"] = bias_radps + rng.normal(0.0, 0.005, len(time_s))
+    _, track = run_filter(HUSKY, time_s, rows)
+    j = track.states.index("gyro_bias_radps")
+    late, error = time_s > 2.0, np.abs(track.mean[:, j] - bias_radps)
+    assert (error < 3.0 * track.std[:, j]).all()
+    assert error[late].max() < 0.002
+    assert track.std[late, j].max() < 0.002
+    yaw = track.states.index("yaw_rad")
+    assert (np.abs(track.mean[:, yaw]) < 3.0 * track.std[:, yaw]).all()
+
+
 def test_gravity_of_a_slope_is_taken_off_by_the_measured_pitch():
     time_s, rows, _ = drive(HUSKY)
     rows["pitch_rad"] = np.full(len(time_s), -0.1)
