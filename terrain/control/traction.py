@@ -9,7 +9,8 @@ With w the desired speed of the fastest wheel, d the commanded speed, u_i the de
 its speed over ground along it, and s* the target slip::
 
     q = min_i g_i w / u_i                      ground speed, seen from the fastest wheel
-    c = max(q + t a, v_l) / (1 - s*)           the speed at which it slips by s*               (cap)
+    q' = a + (q - q') / T                      without the steps of single fixes
+    c = max(q' + t a', v_l) / (1 - s*)         the speed at which it slips by s*               (cap)
     d = w where w <= d, else min(w, max(d, c))                                                 (drive)
 
 - All wheels are commanded ``d / w`` of their speed: the turning centre stays where it is.
@@ -17,9 +18,12 @@ its speed over ground along it, and s* the target slip::
   ground speed, less cap.
 - It is the normalised P controller of slip, ``d + K (s* - s) d`` with ``s = 1 - q / d`` and ``K = 1 / (1 -
   s*)`` (as :mod:`terrain.control.pid` normalises it), acting on the chassis instead of each wheel.
-- Below v_l the slip ratio carries little information on the terrain: v_l replaces the robot's speed.
-- q is delayed by the filter's lag and the command by its transport; t compensates both with the measured
-  acceleration a, limited to that of a start on soft soil, as the acceleration of the first tenths of a second
+- Below v_l the slip ratio carries little information on the terrain: v_l replaces the robot's speed, and d rises
+  as it does while no correction can be made.
+- A receiver moves q at each fix, by centimetres per second: a command that follows at once makes the wheels slip by as
+  much, so that it follows by the acceleration between fixes, and reaches them within T.
+- q is delayed by the filter's lag and the command by its transport; t compensates both with the acceleration a',
+  a behind a low-pass of T, limited to that of a start on soft soil, as the acceleration of the first tenths of a second
   does not last.
 - s* is the target of the terrain until steady motion has shown at which slip it balances; from then on it is
   that slip and a margin, as ``F(s*) > R`` accelerates and more slip adds nothing.  Where d is limited and the
@@ -55,12 +59,14 @@ class TractionSettings(NamedTuple):
     #: the command and half the response time of a motor driver; the acceleration that 4 % of the weight gives
     lead_s: float = 0.15
     lead_max_mps2: float = 0.3
+    smooth_s: float = 0.0  #: T, within which d follows a fix that moves q in a step
     #: standard deviations of the ground speed that are added to q: what is not known holds no robot back
     std_ahead: float = 0.0
     balance_margin_ratio: float = 0.03  #: least s* above the slip that balances steady motion
     #: a robot that is held back accelerates at least by this, or the floor of s* rises
     gain_least_mps2: float = 0.25
     floor_rate_ratio: float = 0.15  #: rate at which the floor rises, per second
+    rise_mps2: float = math.inf  #: largest rate at which d rises
     fade_mps2: float = 1.0  #: rate at which d approaches w while no correction can be made
     #: reduction of a wheel's speed per torque above the mean; its limit as a fraction of the wheel's speed; time
     #: constant of its low-pass
@@ -80,8 +86,18 @@ class TractionSettings(NamedTuple):
 
 SETTINGS = TractionSettings()
 #: Of other than swerve robots: a satellite receiver or a camera gives a speed to 3 or 4 cm/s, which near the launch
-#: speed is 0.2 of slip, and less than half of what a start takes without control; their filter knows slower speeds.
-OTHERS_STD_MAX_RATIO, OTHERS_LAUNCH_MPS = 0.2, 0.15
+#: speed is 0.2 of slip, and less than half of what a start takes without control; what is not known is driven as by a
+#: ramp, slower than the usual 1 m/s^2, and that is the fastest; a robot that gains less than half of it loses more
+#: distance than slip is worth.
+OTHERS = {
+    "std_max_ratio": 0.2,
+    "launch_mps": 0.2,
+    "smooth_s": 0.2,
+    "std_ahead": 0.25,
+    "gain_least_mps2": 0.4,
+    "fade_mps2": 0.7,
+    "rise_mps2": 1.0,
+}
 
 
 class TractionTarget(NamedTuple):
@@ -123,12 +139,7 @@ def settings_of(robot: Robot) -> TractionSettings:
     """
     settings = SETTINGS
     if not (robot.steered and robot.sideways):
-        settings = settings._replace(
-            droop_radps_per_nm=0.0,
-            std_max_ratio=OTHERS_STD_MAX_RATIO,
-            launch_mps=OTHERS_LAUNCH_MPS,
-            std_ahead=0.25,
-        )
+        settings = settings._replace(droop_radps_per_nm=0.0, **OTHERS)
     motors, torque = robot.completed.motors, robot.mass_kg * robot.wheel_radius_m / len(robot.logged_wheels)
     if motors.speed_gain_nmspr == 0.0:
         return settings
@@ -171,6 +182,10 @@ class TractionState(NamedTuple):
     desired_mps: float = 0.0  #: w
     reference_mps: float = 0.0  #: speed that is commanded without a change
     constant_s: float = 0.0  #: for how long it has been
+    smooth_mps: float = (
+        math.nan
+    )  #: q without the steps of single fixes, and its acceleration; NaN where unknown
+    smooth_mps2: float = 0.0
     slow_mps: float = 0.0  #: q behind a low-pass
     balance_ratio: float = math.nan  #: slip of steady motion, NaN until it was measured
     floor_ratio: float = 0.0  #: least s*
@@ -257,6 +272,13 @@ def traction_step(
     if status is TractionStatus.OK and not uncertain <= settings.std_max_ratio:
         status = TractionStatus.UNCERTAIN
     q = 0.0 if math.isinf(q) else q
+    smooth, smooth_mps2 = q, accel
+    if status is TractionStatus.OK and math.isfinite(state.smooth_mps):
+        smooth, part = state.smooth_mps + accel * dt_s, dt_s / max(settings.smooth_s, dt_s)
+        smooth, smooth_mps2 = (
+            smooth + part * (q - smooth),
+            state.smooth_mps2 + part * (accel - state.smooth_mps2),
+        )
     margin = max(settings.balance_margin_ratio, target.margin_ratio)
     aimed = target.traction_ratio  # s*: no more than the balance and its margin, no less than the floor
     balance, floor = state.balance_ratio, state.floor_ratio
@@ -273,9 +295,10 @@ def traction_step(
     if status is not TractionStatus.OK:
         driven = min(desired, was + settings.fade_mps2 * dt_s)
     elif drive_state is DriveState.TRACTION:
-        ahead = q + settings.lead_s * min(max(accel, 0.0), settings.lead_max_mps2)
+        ahead = smooth + settings.lead_s * min(max(smooth_mps2, 0.0), settings.lead_max_mps2)
         cap = max(ahead, settings.launch_mps) / (1.0 - min(aimed, _FLOOR_MAX))
-        driven = min(desired, max(was, cap))
+        rise_mps2 = settings.rise_mps2 if smooth > settings.launch_mps else settings.fade_mps2
+        driven = min(desired, max(was, min(cap, was + rise_mps2 * dt_s)))
         held_s = state.held_s + dt_s if driven < desired else 0.0
     elif drive_state is DriveState.BRAKING and target.braking_mps2 > 0.0:
         stops_in_s = state.braked_from_mps / max(target.braking_mps2, 1e-6)
@@ -324,7 +347,9 @@ def traction_step(
             droop = settings.droop_radps_per_nm * (filtered[i] - mean)
             commands[i] -= sign * min(max(droop, -limit), limit)
     braked_from = 0.0 if braking_s == 0.0 else max(state.braked_from_mps, was)
-    learned = driven, desired, reference, constant_s, slow, balance, floor, held_s, braking_s, braked_from
+    smooth = smooth if status is TractionStatus.OK else math.nan
+    seen = driven, desired, reference, constant_s, smooth, smooth_mps2, slow
+    learned = *seen, balance, floor, held_s, braking_s, braked_from
     slip = math.nan if status is TractionStatus.NO_SLIP else largest_slip
     report = WheelReport(driven, aimed, balance, slip, drive_state, status)
     return np.array(commands), TractionState(*learned, filtered, state.rate_radpm), report

@@ -62,3 +62,12 @@ def test_contacts_carry_the_robot_and_fit_the_records(name):
     assert (of["load_fraction"] * of["y_m"]).sum() == pytest.approx(robot.body.com_y_m, abs=1e-9)
     assert of["ride_ratio"].sum() == pytest.approx(1.0)  # a heave of all corners is one of the body
     assert (of["ride_pitch_1pm"].sum(), of["ride_roll_1pm"].sum()) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+@pytest.mark.parametrize("name", packaged("robots"))
+def test_speed_loops_damp_the_robot_as_a_maker_would_have_them(name):
+    """The damping of ``J w' = K (w* - w) + K_I int (w* - w)``, with each motor's share of the robot's mass in J."""
+    robot = with_assumed(load_robot(name))
+    inertia_kgm2 = robot.mass_kg * robot.wheel_radius_m**2 / len(robot.logged_wheels)
+    gain, integral = robot.motors.speed_gain_nmspr, robot.motors.speed_integral_nmpr
+    assert 0.7 < gain / (2.0 * (integral * inertia_kgm2) ** 0.5) < 1.25
