@@ -6,6 +6,12 @@ AgriMaRo thesis, (7.3) to (7.7))::
     v = (v_x - g' y_i) cos d_i + (v_y + g' x_i) sin d_i
     s = (w r - v) / max(|w r|, |v|)
 
+Of a wheel with rollers the ground holds the component along the axis of the roller that touches it alone, at an angle
+g from d_i: what slides is ``w r cos g`` less the velocity v_g of the centre along that axis; across it the roller turns
+freely.  So v is ``v_g / cos g``, the speed at which the wheel would roll without slip
+(:func:`terrain.kinematics.wheels.rolling_matrix`), and s the same along the axis.  Along the wheel a mecanum robot that
+drives sideways without slip would slip by 1.  Simulated truth, filters, windows and curves have this slip alike.
+
 (7.1) and (7.2), the two regimes of the SAE, are this for v > 0 only; the larger absolute value is safe
 everywhere.  The sign of s is that of the slip speed **along the wheel's own x axis**: positive in traction
 and negative in braking where the wheel rolls forward, and the reverse where it rolls backward, be it that the

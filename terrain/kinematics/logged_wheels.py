@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.kinematics.wheels import rolled_twist, wheel_frame_velocities
+from terrain.kinematics.wheels import rolled_twist, rolling_matrix
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, TWIST
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
@@ -118,9 +118,9 @@ def speed_columns(channels: Sequence[str], robot: Robot | None) -> tuple[list[in
 
 def wheel_and_ground_speed(truth: Stream, robot: Robot) -> tuple[Array, Array]:
     """Return the true wheel speed, by the nominal radius, and speed over ground along each wheel, (n, wheels)."""
-    steer = truth.columns(f"steer_{wheel}_rad" for wheel in robot.wheels)
-    twist = truth.columns(TWIST)
-    along, _ = wheel_frame_velocities(twist, robot.wheel_positions_m, steer)
+    directions = truth.columns(f"steer_{wheel}_rad" for wheel in robot.wheels) + robot.wheel_directions_rad
+    rolling = rolling_matrix(robot.wheel_positions_m, directions, robot.roller_angles_rad)
+    along = np.einsum("nij,nj->ni", rolling, truth.columns(TWIST))
     return truth.columns(f"wheel_{wheel}_radps" for wheel in robot.wheels) * robot.wheel_radius_m, along
 
 

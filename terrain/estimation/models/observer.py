@@ -75,7 +75,6 @@ FIX_STD_M, FLOAT_STD_M = 0.02, 0.5
 """Of a position whose standard deviation is not given: with a fix (RTK), and without one, or where neither is known."""
 
 CHANNELS: Mapping[str, tuple[str, ...]] = {
-    "steering": ("angle_front_rad",),
     "imu": ("gyro_z_radps", "roll_rad", "pitch_rad", "accel_y_mps2", "accel_x_mps2"),
     "pose": ("position_x_m", "position_y_m", "yaw_rad"),
     "gnss": (
@@ -86,7 +85,7 @@ CHANNELS: Mapping[str, tuple[str, ...]] = {
     "odometry": ("speed_x_mps", "speed_y_mps"),
     "lidar": ("speed_x_mps", "speed_y_mps"),
 }
-"""Channels that are read of each stream beside the wheels; those that a log lacks are unknown."""
+"""Channels that are read of each stream beside wheels and steering; those that a log lacks are unknown."""
 
 STREAM_OF_FIX = {
     "gnss": ("gnss",),
@@ -276,11 +275,12 @@ class ObserverFeed(_WithMemory):
                 and not ("lidar" in measured and "pose" in self._fixes)
             ):
                 self._fixes[sensor] = measured[0]
+        self._channels = {"steering": robot.steer_channels, **CHANNELS}
         read = {"steering", "imu", *self._fixes.values()}
         read |= {"pose", "gnss", "compass"} if self._takes_place else set()
         self.queues = {
             stream: SampleQueue(places_among(names, channels[stream]))
-            for stream, names in CHANNELS.items()
+            for stream, names in self._channels.items()
             if channels.get(stream) and stream in read
         }
         self.dropped: Counter[str] = Counter()
@@ -317,7 +317,7 @@ class ObserverFeed(_WithMemory):
         speeds = {name: float(wheels[column]) * self.mps_per_rate for name, column in self._speeds.items()}
         self.speeds_mps = np.array(list(speeds.values()))
         row |= speeds | dict(zip(INERTIAL_ROWS, self._means("imu", time_s, due), strict=True))
-        (row["steer_front_rad"],) = self._means("steering", time_s, due, last=True)
+        row |= zip(self._robot.steer_rows, self._means("steering", time_s, due, last=True), strict=True)
         if self._terms and isinstance(self._robot, BicycleRobot):
             # what is remembered before a tick may be gone back to
             self._lags = [{factor: lag.copy() for factor, lag in own.items()} for own in self._lags]
@@ -335,7 +335,7 @@ class ObserverFeed(_WithMemory):
     def _means(self, stream: str, time_s: float, due: Mapping[str, Due], last: bool = False) -> list[float]:
         """Return mean, or last, of what is known of each channel since the tick before; else the last known, held."""
         samples, means = [(stamp_s, sample.tolist()) for stamp_s, _, sample in due.get(stream, ())], []
-        for k in range(len(CHANNELS[stream])):
+        for k in range(len(self._channels[stream])):
             known = [(stamp_s, sample[k]) for stamp_s, sample in samples if not math.isnan(sample[k])]
             if known:
                 self._held[stream, k] = known[-1]

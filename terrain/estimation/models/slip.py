@@ -121,6 +121,8 @@ UNKNOWN_RATIO = 0.25
 LEAST_MPS, STANDING_MPS, VIBRATION_S, CHANGE_S, MEAN_S = 0.2, 0.01, 0.3, 0.15, 0.4
 """Least speed that shows a heading, that of wheels that stand; low-passes of vibration, of how the wheels' speeds
 change, and of what their slip is multiplied by."""
+LEAST_SLOW = 0.01
+"""Of m, below which it does not matter how far behind what it is multiplied by is."""
 N_JUDGED = 7
 """Number of sensors beside the wheels: the status tells what becomes of these alone."""
 MOST_MPS, MOST_RADPS, MOST_MPS2 = 60.0, 30.0, 100.0
@@ -382,14 +384,18 @@ class SlipFilter(FilterObserver):
         dt_s = dt_s if 0.0 <= dt_s < math.inf else 0.0
         speeds = np.array([given[name] for name in self._speeds])
         speeds[~(np.abs(speeds) <= MOST_MPS)] = np.nan
+        angles, (logged, across, _) = np.array([given[name] for name in self._steer]), self._wheels
+        speeds[np.isin(logged, across[np.isnan(angles)])] = np.nan  # of a wheel that drives who knows where
         before_mps = np.where(np.isfinite(self._mean_mps), self._mean_mps, np.nan_to_num(speeds))
+        slow = np.abs(self.filter.mean[[_SLOW + group for group in self._wheels.groups[: speeds.size]]])
+        behind_mps = np.fmin(self._scatter_mps / np.maximum(slow, LEAST_SLOW), np.abs(speeds))
+        before_mps = np.clip(before_mps, *(np.nan_to_num(speeds) + sign * behind_mps for sign in (-1.0, 1.0)))
         gain = -math.expm1(-dt_s / MEAN_S)
         self._mean_mps = before_mps + gain * np.nan_to_num(speeds - before_mps)
         rates_mps2 = self._rates(speeds, dt_s)
-        angles = np.array([given[name] for name in self._steer])
         inputs = self._inputs(given, speeds, rates_mps2, before_mps, angles, dt_s)
-        z, logged, across = np.full(MOST_ROWS, np.nan), *self._wheels[:2]
-        z[: logged.size] = np.where(np.isin(logged, across[np.isnan(angles)]), np.nan, 0.0 * speeds)
+        z = np.full(MOST_ROWS, np.nan)
+        z[: logged.size] = 0.0 * speeds
         if np.isfinite(speeds).any():
             z[logged.size : logged.size + across.size] = 0.0 * angles
         if isinstance(self._robot, BicycleRobot):
@@ -437,9 +443,13 @@ class SlipFilter(FilterObserver):
 
         What m and chi are multiplied by are the low-passed speeds of before: by those of the tick, whose ripple the
         body does not follow, m would grow by its covariance with the innovation, the ratio of an error in variables.
+        But no further behind than a wheel's speed scatters, times m: where m is near 1, and the wheels start or stop,
+        what they are behind by would be a speed over ground.
         """
         n, inputs, (logged, across, _) = speeds.size, np.zeros(len(_INPUTS)), self._wheels
         known, rolling, turning = np.nan_to_num(speeds), np.zeros((MOST_ROWS, 3)), np.zeros(MOST_ROWS)
+        smooth_mps = np.nan_to_num(self._smooth_mps)
+        size = math.sqrt(max(float(np.mean(known**2)), float(np.mean(smooth_mps**2))))
         rolling[:n] = self._rolling
         if self._steer:
             directions, positions_m = (
@@ -464,7 +474,6 @@ class SlipFilter(FilterObserver):
             gain, apart = -math.expm1(-dt_s / VIBRATION_S), accel - self._accel_mps2
             self._accel_mps2 += gain * apart
             self._shaken_square += gain * (apart * apart - self._shaken_square)
-        size = math.sqrt(max(float(np.mean(known**2)), float(np.mean(before_mps**2))))
         ages = [given[name] if 0.0 <= given[name] <= OLDEST_S else 0.0 for name in _AGE_ROWS]
         inputs[: 3 * MOST_ROWS], inputs[_SPEEDS][:n], inputs[_TURNING] = rolling.ravel(), known, turning
         if self._robot.skids and size > 0.0:  # turning on the spot says nothing of slip straight ahead
@@ -690,7 +699,7 @@ class SlipFilter(FilterObserver):
         if age_s == math.inf:
             return "no position, pose or speed over ground has come yet"
         if np.isnan(fastest_mps).all():
-            return "no speed of a wheel comes"
+            return "no speed of a wheel comes, or no angle of a steered one"
         if np.nanmax(fastest_mps) < MIN_SPEED_MPS:
             return "the wheels stand"
         return (

@@ -500,7 +500,7 @@ def step(
         axis = heading + plant.wheel_direction_rad[i] + roller
         cos, sin, wheel_speed = math.cos(axis), math.sin(axis), w.rate_radps * radius_m
         along, across = cos * v_x + sin * v_y, -sin * v_x + cos * v_y
-        along /= math.cos(roller)  # the speed at which the wheel would roll without slip
+        along /= math.cos(roller)  # the speed at which the wheel would roll without slip (terrain.slip)
         fastest = max(abs(wheel_speed), abs(along))
         out.wheel_radps, out.steer_rad = wheel_speed / radius_m, heading  # of this instant, as the slip is
         out.slip_ratio = (wheel_speed - along) / fastest if fastest >= 0.05 else np.nan

@@ -31,7 +31,10 @@ from terrain.kinematics.wheels import (
 )
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
-from terrain.simulation.run import simulate_run
+from terrain.simulation.run import simulate, simulate_run
+from terrain.simulation.scenario import Scenario
+from terrain.slip import slip_ratio
+from terrain.terramechanics.soil import load_soil
 
 ROBOT, HUSKY, ROBOTINO = (load_robot(name) for name in ("agrimaro", "husky", "robotino"))
 WHEELS_M, RADIUS_M = ROBOT.wheel_positions_m, ROBOT.wheel_radius_m
@@ -252,6 +255,19 @@ def test_the_sign_of_a_simulated_slip_is_that_of_traction_in_both_directions():
     np.testing.assert_array_equal(slip[clear] > 0.0, ((wheel_speed - ground) * np.sign(ground) > 0.0)[clear])
     rates = Stream(np.arange(2.0), np.zeros((2, 3)), [f"wheel_{i}_radps" for i in (1, 2, 3)])
     assert np.isnan(true_slip(rates, ROBOT.wheels)).all()  # never defined
+
+
+@pytest.mark.parametrize("robot", [ROBOTINO, load_robot("omnirobot")])
+def test_a_wheel_slips_along_the_axis_of_its_rollers(robot):
+    twist = np.zeros((151, 3))
+    twist[20:, 1] = 0.3  # to the left
+    drive = Scenario("left", 50.0, 0.02 * np.arange(151), twist, ((0.0, "asphalt"),))
+    truth = simulate(robot, drive, {"asphalt": load_soil("asphalt")}, 0).streams["truth"]
+    wheel_speed, ground = wheel_and_ground_speed(truth, robot)
+    fast = np.abs(wheel_speed) > 0.1
+    recorded = truth.columns(f"slip_{wheel}_ratio" for wheel in robot.wheels)
+    np.testing.assert_allclose(recorded[fast], slip_ratio(wheel_speed, ground)[fast], atol=1e-9)
+    assert np.abs(recorded[truth.time_s > 1.5][:, fast.any(axis=0)]).max() < 0.05
 
 
 @pytest.mark.parametrize("robot", [HUSKY, ROBOTINO, load_robot("marmotte"), load_robot("omnirobot")])

@@ -11,10 +11,12 @@ from terrain.estimation.live import live_estimator
 from terrain.estimation.models import slip as module
 from terrain.estimation.models.choice import suitable_filter
 from terrain.estimation.models.observer import ObserverStatus, observe
+from terrain.estimation.models.observer import rows_of as feed_rows
 from terrain.estimation.models.slip import SlipFilter, rows_of_wheels
 from terrain.estimation.observe import observe_run, summarize_observer
 from terrain.kinematics.wheels import rolling_matrix
 from terrain.logs.replay import replay as replayed
+from terrain.records import RunLog, Stream
 from terrain.robots import SkidSteerRobot, load_robot
 from terrain.simulation.run import simulate_run
 from terrain.simulation.sensors import Gnss
@@ -121,7 +123,10 @@ def test_a_wheel_that_stands_tells_the_ground_stands_and_nothing_of_its_slip():
     assert np.isnan(track.slip[after]).all()
     for side in ("left", "right"):
         name = f"ground_slip_{side}_ratio"
-        assert track.state(name)[after] == pytest.approx(track.state(name)[before], abs=0.02)
+        std = track.std[
+            before, track.states.index(name)
+        ]  # wheels that stop within a tick contradict the accelerometer
+        assert track.state(name)[after] == pytest.approx(track.state(name)[before], abs=1.5 * std)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.1, 0.2])
@@ -272,6 +277,37 @@ def test_spinning_wheels_show_no_heading_and_slip_that_is_seen_is_one():
 
 
 # -- what is not observed --------------------------------------------------------------------------------------------
+
+
+def test_a_steered_wheel_slips_by_its_own_angle_and_not_without_one():
+    time_s, rows, _ = drive(SWERVE, n=800)
+    names = [f"steer_{wheel}_rad" for wheel in SWERVE.wheels]
+    motors = [rows[f"speed_{wheel}_mps"] / SWERVE.wheel_radius_m for wheel in SWERVE.wheels]
+    streams = {
+        "wheels": Stream(time_s, SWERVE.motors.reduction_ratio * np.array(motors).T, SWERVE.rate_channels),
+        "steering": Stream(time_s, np.array([rows[name] for name in names]).T, SWERVE.steer_channels),
+    }
+    _, fed, _ = feed_rows(RunLog("a", "agrimaro", streams), SWERVE, SlipFilter(SWERVE).rows)
+    for name in (*names, "speed_3_mps"):
+        assert fed[:, SlipFilter(SWERVE).rows.index(name)] == pytest.approx(rows[name])
+    rows[names[0]] = np.where(time_s > 12.0, np.nan, rows[names[0]])
+    _, track = run_filter(SWERVE, time_s, rows)
+    assert np.isnan(track.slip[time_s > 12.0, 0]).all()
+    assert np.isfinite(track.slip[time_s > 12.0, 1:]).all()
+
+
+def test_wheels_that_spin_in_place_start_and_stop_without_a_speed_over_ground():
+    time_s = PERIOD_S * np.arange(1500)
+    rolled_mps = 0.4 * np.clip(5.0 * np.minimum(time_s % 5.0, 4.0 - time_s % 5.0), 0.0, 1.0)
+    x_m = np.cumsum(0.05 * rolled_mps) * PERIOD_S
+    rows = {"speed_left_mps": rolled_mps, "speed_right_mps": rolled_mps, "yaw_rate_radps": 0.0 * time_s}
+    for name, value in (("pose_x_m", x_m), ("pose_y_m", 0.0 * x_m), ("pose_yaw_rad", 0.0 * x_m)):
+        rows[name] = np.where(np.arange(1500) % 5 == 0, value, np.nan)
+    rows["pose_age_s"] = 0.0 * time_s
+    _, track = run_filter(HUSKY, time_s, rows)
+    late = time_s > 10.0
+    assert np.abs(track.state("speed_x_mps") - 0.05 * rolled_mps)[late].max() < 0.05
+    assert np.nanmin(track.slip[late & (rolled_mps > 0.3)]) > 0.85
 
 
 def test_without_a_reference_slip_is_unknown_and_the_reason_is_stated():
