@@ -130,11 +130,15 @@ def _draw_panel(axes: Axes, panel: Panel, names: dict[str, int]) -> None:
 
 
 def _draw_strip(axes: Axes, mark: Mark, names: dict[str, int], thin: bool) -> None:
-    """Draw intervals in the colours of their names; where nothing else is drawn, without a vertical axis."""
+    """Draw intervals in the colours of their names; where nothing else is drawn, without a vertical axis.
+
+    Behind other marks the colours are taken from the last on, grey, which lines have last.
+    """
     labelled: set[str] = set()
     for start, end, name in mark.x:
+        number = names.setdefault(name, len(names)) % len(COLOURS)
         style: dict[str, Any] = {
-            "color": COLOURS[names.setdefault(name, len(names)) % len(COLOURS)],
+            "color": COLOURS[number if thin else -1 - number],
             "alpha": 0.75 if thin else 0.18,
             "lw": 0,
         }

@@ -92,11 +92,13 @@ def report(result: ObserverResult) -> Report:
         for run in result.runs
         for name, slip in run.slip.items() or [("not estimated", None)]
     ]
-    statuses = []
+    lacking = set.intersection(*(set(run.missing) for run in result.runs)) if result.runs else set()
+    statuses = [f"not measured in any run: {', '.join(sorted(lacking))}"] if lacking else []
     for run in result.runs:
         times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in run.status_s.items())
         dropped = f"; left out: {sum(run.dropped.values())} samples" if run.dropped else ""
-        missing = f"; not measured: {', '.join(run.missing)}" if run.missing else ""
+        own = [name for name in run.missing if name not in lacking]
+        missing = f"; not measured: {', '.join(own)}" if own else ""
         why = f"; slip is not known: {run.reason}" if run.reason else ""
         statuses.append(f"{run.run_id}: {times}{dropped}{missing}{why}")
     return tracks_report(
@@ -160,10 +162,14 @@ def path_figure(found: ObserverEstimate) -> Figure:
     """Show the estimated path, the fixes, and the true one where it is known."""
     own, true = found.path()
     marks: list[Mark] = []
-    if "position_x_m" in found.observer.rows and "gnss" in found.run.streams:
-        gnss = found.run.streams["gnss"]
-        fixes = gnss.channel("position_x_m"), gnss.channel("position_y_m")
-        marks.append(Points("fixes", *fixes, colour=4))
+    placed = "position_x_m" in found.observer.rows or found.observer.in_world
+    for name in ("pose", "gnss") if placed else ():
+        stream = found.run.streams.get(name)
+        if stream is not None and "position_x_m" in stream.channels:
+            marks.append(
+                Points(f"measured ({name})", *stream.columns(["position_x_m", "position_y_m"]).T, colour=4)
+            )
+            break
     marks.append(Line("estimate", own.real, own.imag, 0))
     if true is not None:
         marks.append(Line("truth", true.real, true.imag, TRUTH_COLOUR, dashed=True))

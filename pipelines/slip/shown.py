@@ -8,7 +8,7 @@ from typing import Any
 
 from pipelines.report.figure import Figure
 from pipelines.report.numbers import enumerated
-from pipelines.report.tree import Column, Part, Table
+from pipelines.report.tree import Column, Part, Table, value_at
 from terrain.files.atomic import atomic_write
 
 SHOWN_ROWS = 8  #: Rows of a table that is continued in the details
@@ -30,6 +30,12 @@ def within_one_session(one_session: Mapping[str, bool]) -> str:
     names = [name for name, one in one_session.items() if one]
     where = "" if len(names) == len(one_session) else f" on {enumerated(names)}"
     return f"Within one session{where}: what another day does is not shown. " if names else ""
+
+
+def known_columns(columns: Sequence[Column], rows: Sequence[Any]) -> list[Column]:
+    """Return the columns in which any of the records has a value."""
+    cells = [(each, [value_at(row, each.of or 0) for row in rows]) for each in columns]
+    return [each for each, values in cells if any(value is not None and value == value for value in values)]
 
 
 def first_rows(

@@ -11,7 +11,7 @@ from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from pipelines.report.numbers import enumerated, format_value, plural
 from pipelines.report.results import Progress, described
 from pipelines.report.tree import Column, Part, Report, Table, Text, sections
-from pipelines.slip.shown import named, within_one_session
+from pipelines.slip.shown import known_columns, named, within_one_session
 from pipelines.slip.table import SLIP, TARGET, TARGETS, LearnedSlipTable, fields_of
 from terrain.control.learned_table import MIN_RUNS, Transfer, learn_surfaces
 from terrain.errors import DataError
@@ -82,7 +82,6 @@ SURFACES = (
     Column("runs", of="slip.n_runs"),
     Column("slip", SLIP, of="slip.slip_ratio"),
     Column("interval", SLIP, of="slip.interval"),
-    Column("of", of="slip.interval_of"),
     Column("current", ".2f", "A", of=lambda row: row["current_a"][0]),
     Column("thrust over load", ".2f", of=lambda row: row["thrust_ratio"][0]),
     *TARGETS,
@@ -127,7 +126,7 @@ def report(result: SteadyTargets) -> Report:
         if row["slip"].n_sessions
     }
     title = f"target slip of {result.robot}, measured from outside"
-    parts: list[Part] = [Table(SURFACES, rows, title, STEADY)]
+    parts: list[Part] = [Table(known_columns(SURFACES, rows), rows, title, STEADY)]
     if result.transfers:
         parts.append(Table(TRANSFERS, result.transfers, "a target of one session in another", INDEPENDENT))
     if result.skipped:

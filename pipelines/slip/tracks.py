@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 
 from pipelines.report.figure import Band, Figure, Line, Mark
 from pipelines.report.results import Progress, Result, described
-from pipelines.report.tree import Column, Part, Report, sections, value_at
-from pipelines.slip.shown import first_rows
+from pipelines.report.tree import Column, Part, Report, sections
+from pipelines.slip.shown import first_rows, known_columns
 from terrain.records import Array, RunLog
 
 Pictures = Callable[[], Mapping[str, Figure]]  #: Makes the pictures of a run, by name
@@ -77,8 +77,8 @@ def tracks_report(
     texts : a section of the details
     """
     records, columns, heading = rows
-    columns = [each for each in columns if any(_known(value_at(row, each.of or 0)) for row in records)]
-    pictures, (first, all_rows) = dict(result.pictures), first_rows(records, columns, heading)
+    first, all_rows = first_rows(records, known_columns(columns, records), heading)
+    pictures = dict(result.pictures)
     lead = next((name for name in pictures if name.endswith("_slip")), next(iter(pictures), ""))
     writing = f"terrain estimate --data DIR --filter {result.filter} --out runs/"
     return Report(
@@ -89,11 +89,6 @@ def tracks_report(
         sections(all_rows, texts, ("Pictures", list(pictures.values())), ("Not read", result.skipped)),
         writing if result.out is None else f"terrain crossval --data {result.out}",
     )
-
-
-def _known(value: Any) -> bool:
-    """Return whether a cell says anything."""
-    return value is not None and value == value  # NaN is not itself
 
 
 def estimated(

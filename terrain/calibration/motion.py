@@ -732,15 +732,17 @@ NOTE = {
     "effective_track_m": "skidding included, by the described radius",
     "gyro_scale_ratio": "of readings over true rates",
 }
+SLIPS = (
+    "it is not apart from the slip of this ground: wheels of the described radius move the robot {:.0f} % less than "
+    "they roll; drive hard ground (asphalt, concrete), or label it so"
+)
 BEHIND = "behind the gyro", "behind the wheels: there is no gyro"
-#: By how much motion that builds up behind the wheels may look like a delay or a scale of the gyro, where no yaw is
-#: measured from outside: 0.16 s and 0.03 of a simulated robot on grass.
-BUILT_UP = dict.fromkeys(("wheels_delay_s", "gnss_delay_s", "odometry_delay_s"), 0.2) | {
-    "gyro_scale_ratio": 0.04
-}
+#: What motion that builds up behind the wheels looks like, where no yaw is measured from outside: by 0.16 s and 0.03
+#: of a simulated robot on grass, as much as it usually is.
+BUILT_UP = ("wheels_delay_s", "gnss_delay_s", "odometry_delay_s", "gyro_scale_ratio")
 SOFT = (
-    "on soft ground motion builds up behind the wheels, which looks like it: the interval is narrow on hard ground, "
-    "labelled"
+    "on soft ground motion builds up behind the wheels, which looks like it: drive hard ground (asphalt, concrete), or "
+    "label it so"
 )
 TURNING = "of the antenna ahead of where the robot turns about, which shows with it alone: 0 where that is the origin"
 
@@ -768,11 +770,11 @@ def findings_by(
         value, std = float(fit.value[k]), float(fit.std[k])
         at, low, high = (number.value(robot, value + by * std) for by in (0.0, -1.0, 1.0))
         bounded = STAMP_S if name.endswith("delay_s") else 0.0
-        soft = robot.skids and not hard and not log.has_yaw and name in BUILT_UP
-        bounded = BUILT_UP[name] if soft else bounded
+        if robot.skids and not hard and not log.has_yaw and name in BUILT_UP and not contradicted:
+            found += undetermined([number.place], SOFT)
+            continue
         behind = BEHIND[not len(log.gyro_s)] if name != "steering_delay_s" else "behind the wheel speeds"
         notes = [NOTE.get(name, ""), behind if name.endswith("delay_s") else ""]
-        notes += [SOFT] * soft
         notes += [TURNING] * (robot.skids and number.place == "antenna.lever_x_m")
         if robot.skids and name == "rolling_radius_m" and stated:
             least, most = SLIP_RATIO if hard else SOFT_SLIP_RATIO
@@ -780,6 +782,11 @@ def findings_by(
             notes = [
                 f"slip of {100 * least:g} to {100 * most:g} % assumed: only the radius less the slip is to be seen"
             ]
+        # tyres roll by at most a few percent less than described: what is beyond is slip of this ground
+        judged = name == "rolling_radius_m" and stated and not hard and fit.identified[k] and not contradicted
+        if judged and value + float(half_width(std, dof)) < -SOFT_SLIP_RATIO[1]:
+            found += undetermined([number.place], SLIPS.format(-100.0 * value))
+            continue
         half = float(half_width(abs(high - low) / 2, dof, bounded=bounded))
         shown = fit.identified[k] and not contradicted
         if not shown or not float(half_width(std, dof)) < number.widest / 2 or not math.isfinite(half):
@@ -830,7 +837,7 @@ def motion_findings(runs: Sequence[RunLog], robot: Robot, hard: Sequence[str] = 
     found, why = dict[str, Finding](), MISSING
     for source in sources:
         fitted, is_hard = None, False
-        for chosen in (on_hard, list(runs)) if robot.skids else (list(runs),):
+        for chosen in (on_hard, list(runs)):
             try:
                 fitted = fit_motion(chosen, robot, source) if chosen else None
             except DataError as error:
@@ -840,7 +847,7 @@ def motion_findings(runs: Sequence[RunLog], robot: Robot, hard: Sequence[str] = 
                 break
         if fitted is None:
             continue
-        where = ("on hard ground" if is_hard else "on any ground") if robot.skids else ""
+        where = "on hard ground" if is_hard else "on any ground" if robot.skids else ""
         rows = findings_by(fitted, robot, is_hard, where)
         if robot.skids:
             for ground in sorted({run.terrains[0] for run in runs if len(run.terrains) == 1}):

@@ -24,7 +24,7 @@
       if (isStrip(mark)) {
         names.forEach((name, i) => {
           const spans = mark.x.filter((span) => span[2] === name);
-          if (spans.length || shared.includes(name)) drawn.push({ kind: "strip", label: name, colour: i, number: i, x: spans, thin });
+          if (spans.length || shared.includes(name)) drawn.push({ kind: "strip", label: name, colour: thin ? i : COLOURS.length - 1 - i % COLOURS.length, number: i, x: spans, thin });
         });
         continue;
       }
@@ -128,7 +128,7 @@
     const tables = own.map((mark) => [mark.x, mark.y]);
     const data = tables.length ? uPlot.join(tables, tables.map(() => [1])) : [[full.x[0], full.x[1]]];
     for (const _ of drawn) data.push(data[0].map(() => null));
-    const series = [{ label: panel.x_label || (last && figure.x_label) || "x", value: (u, v) => written(v) }];
+    const series = [{ label: panel.x_label || figure.x_label || "x", value: (u, v) => written(v) }];
     for (const mark of own) {
       const colour = colourOf(mark, mark.number), line = mark.kind === "line";
       series.push({ label: mark.label || " ", stroke: colour, width: line ? 1.4 : 0, dash: mark.dashed ? [6, 4] : undefined,
@@ -180,6 +180,8 @@
         }],
       },
     }, data, holder);
+    for (const row of holder.querySelectorAll(".u-legend .u-series"))
+      if (!row.textContent.replace(/[^\p{L}\p{N}]/gu, "")) row.hidden = true;  // a mark without a name
     u.thin = thin;
     u.reset = () => { zoomY.x = null; };
     u.rescale = () => { u.setScale("x", { min: full.x[0], max: full.x[1] }); u.setScale("y", { min: full.y[0], max: full.y[1] }); };
