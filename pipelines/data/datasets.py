@@ -183,9 +183,10 @@ def read(settings: RunsSettings, *, refuse: bool = True) -> ReadRuns:
     DataError
         if a run that is to be aligned has no gyro or no wheel speeds.
     """
+    from terrain.files.names import packaged, shown
     from terrain.logs.samples import one_spelling
 
-    folder, repair = settings.data, settings.repair
+    folder, repair, robot = settings.data, settings.repair, named_robot(settings)
     runs: list[RunLog] = []
     skipped: list[str] = []
     places: dict[str, list[str]] = {}
@@ -197,6 +198,9 @@ def read(settings: RunsSettings, *, refuse: bool = True) -> ReadRuns:
                 raise
             skipped.append(f"run skipped: {error}")
             continue
+        if robot is not None and run.robot not in (robot.name, *packaged("robots")):
+            named = f"run {run.run_id} is of robot {shown(run.robot)}, --robot describes {robot.name!r}"
+            raise LogError(f"{folder}: {named}: name both alike, or give the other's file")
         runs.append(run)
         places.setdefault(run.run_id, []).append(str(loader.run_folder or run.source))
     if not runs:
@@ -208,7 +212,6 @@ def read(settings: RunsSettings, *, refuse: bool = True) -> ReadRuns:
     runs = sorted(one_spelling(str(folder), runs, repair=repair), key=attrgetter("run_id"))
     if isinstance(settings, AlignedRunsSettings):
         runs = chosen_runs(runs, settings)
-    robot = named_robot(settings)
     verdicts = verdicts_of(runs, robot)
     doubts = doubts_of(verdicts)
     if repair:
@@ -289,7 +292,9 @@ def _described(run: RunLog, robot: Robot | None) -> tuple[RunLog, Described]:
     fastest_mps = getattr(known, "speed_max_mps", _wheel_rate_max_radps(known) * known.wheel_radius_m)
     motors = known.motors if known.describes("motors") else None
     twist, contradiction = _motion_of_wheels(run, known)
+    logged = run.streams["wheels"].channels if "wheels" in run.streams else known.rate_channels
     return run, Described(
+        lacking=tuple(channel for channel in known.rate_channels if channel not in logged),
         track_m=known.track_m,
         speed_max_mps=fastest_mps,
         twist=twist,

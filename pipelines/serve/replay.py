@@ -22,7 +22,7 @@ from pipelines.live.pilot import LivePilot
 from pipelines.live.session import chain_of
 from pipelines.live.windows import needs_filter
 from pipelines.report.figure import Figure, Line, Panel, Strip
-from pipelines.report.numbers import format_counts, format_value, plural
+from pipelines.report.numbers import format_counts, format_value, plain_line, plural
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.tree import Column, Part, Report, Table, Text, sections
 from pipelines.serve.serve import Settings, loaded, stopping
@@ -32,7 +32,6 @@ from terrain.discrepancy.runs import in_order
 from terrain.discrepancy.watch import BLOCK_S, WORDS, Alarm, Watch, clock_text, read_watched
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live import CHANNELS
-from terrain.files.names import printable
 from terrain.kinematics.logged_wheels import with_desired_twist
 from terrain.logs.replay import SENSORS, replay
 from terrain.records import RunLog
@@ -295,7 +294,7 @@ def replay_run(
                 driven_s += BLOCK_S
                 blocks.append(WatchedBlock(run.run_id, block.start_s, driven_s, block.why, watch.levels))
             for sentence in watch.news:
-                print(printable(f"{run.run_id}  {sentence}"), flush=True)
+                print(plain_line(f"{run.run_id}  {sentence}"), flush=True)
         belief = chain.belief.terrain
         believed[belief] += 1
         for output in done.windows:
@@ -304,7 +303,7 @@ def replay_run(
             window = ObservedWindow(*known, belief, chain.target_ratio, label)
             before = windows[-1] if windows else None
             if before is None or (window.terrain, window.believed) != (before.terrain, before.believed):
-                print(printable(f"{run.run_id}  {window}"), flush=True)
+                print(plain_line(f"{run.run_id}  {window}"), flush=True)
             windows.append(window)
     elapsed_s = perf_counter() - begin_s
     counts = Counter(window.terrain for window in windows if not window.refused)

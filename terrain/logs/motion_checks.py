@@ -78,6 +78,7 @@ class Described(NamedTuple):
     front_driven: bool = False  #: whether the steered wheel drives, which may turn beyond a right angle
     steering_rate_max_radps: float = math.nan
     current_max_a: float = math.inf
+    lacking: tuple[str, ...] = ()  #: channels of its wheels that the run has not, beside some that it has
     #: part of the speeds of steered wheels that no twist of the body explains: as logged, and with angles turned
     contradiction: tuple[float, float] = (math.nan, math.nan)
 
@@ -177,7 +178,7 @@ def is_short(run: RunLog) -> bool:
 
 def _compared(sources: Sequence[Seen], robot: Described) -> list[Finding]:
     pairs = _speeds(sources, robot), _yaw_rates(sources, robot), _directions(sources, robot)
-    return [*pairs[0], *pairs[1], *pairs[2], *_acceleration(sources)]
+    return [*pairs[0], *pairs[1], *pairs[2], *_course_of_receiver(sources), *_acceleration(sources)]
 
 
 # -- What each sensor shows, a mean of a second ---------------------------------------------------------------
@@ -524,6 +525,26 @@ def _directions(sources: Sequence[Seen], robot: Described) -> list[Finding]:
         elif robot.sideways is False or by.is_known:
             found.append(Finding("direction", 0, seen.name, ahead, of))
     return found
+
+
+def _course_of_receiver(sources: Sequence[Seen]) -> list[Finding]:
+    """Compare the directions of a receiver's velocity and of its positions, of one frame, where both are as fast."""
+    of = {seen.name: seen.velocity_mps for seen in sources if seen.velocity_mps is not None}
+    velocity, moved = of.get("the velocity of gnss"), of.get("the position of gnss")
+    if velocity is None or moved is None:
+        return []
+    speeds = np.hypot(*velocity.T), np.hypot(*moved.T)
+    slow, fast = np.minimum(*speeds), np.maximum(*speeds)
+    goes = (slow > MIN_SPEED_MPS) & (fast < DOUBTFUL_RATIO * slow)
+    if (n := int(goes.sum())) < MIN_POINTS:
+        return []
+    cosine = float(np.median((velocity * moved).sum(axis=1)[goes] / (slow * fast)[goes]))
+    apart_deg = math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
+    text = f"direction: the velocity of gnss is {apart_deg:.0f} degrees from its path"
+    if cosine >= 0.5:
+        return [Finding("direction", 0, "the velocity of gnss", cosine, text)]
+    why = "a course that is not from north, clockwise, or latitude and longitude exchanged?"
+    return [Finding("direction", _level(n, True, True), "the velocity of gnss", cosine, f"{text}: {why}")]
 
 
 def _still_positions(run: RunLog, sources: Sequence[Seen]) -> list[Finding]:

@@ -193,6 +193,9 @@ def judge(run: RunLog, robot: Described = UNKNOWN_ROBOT) -> tuple[Check, ...]:
     checks = [_gravity(known), _turns(known, robot), _speeds(known, robot)]
     for name, stream in run.streams.items():
         checks += [_sampling(name, stream), *check_names(name, stream)]
+    if robot.lacking:
+        text = f"channels: 'wheels' lacks {', '.join(robot.lacking)}: motion and slip stay unknown"
+        checks.append(Check("channels", DOUBTFUL, "wheels", float(len(robot.lacking)), text))
     motion = map(_check_of, motion_findings(known, robot))
     return (*checks, *motion, *_values(run), *_constants(known), _overlap(run))
 

@@ -52,7 +52,7 @@
         y: [-0.6, categories.length - 0.4] };
     const x = flat.flatMap((m) => isStrip(m) ? [m.x.flatMap((s) => [s[0], s[1]])] : [m.x]);
     const y = flat.flatMap((m) => isStrip(m) ? [] : [m.y, m.low, m.high]);
-    return { x: panel.x_range || extent(x, panel.equal ? 0.04 : 0), y: panel.y_range || extent(y, 0.05) };
+    return { x: panel.x_range || extent(x, panel.equal ? 0.04 : flat.some((m) => m.kind === "points") ? 0.02 : 0), y: panel.y_range || extent(y, 0.05) };
   }
 
   function drawMark(u, mark, vertical) {

@@ -70,6 +70,15 @@ def test_python_and_a_cache_refuse_it_too(terrain, in_g):
     assert str(error.value) == SENTENCE
 
 
+@pytest.mark.parametrize(
+    "command", [name for name, words in COMMANDS.items() if "--robot" not in words and name != "quickstart"]
+)
+def test_every_command_refuses_runs_of_another_robot_than_the_one_described(refused, place, drive, command):
+    write_run(replace(drive("r", "GRASS", 0, duration_s=8.0), robot="tractor"), place / "data")
+    sentence = "data: run r is of robot 'tractor', --robot describes 'husky': name both alike, or give the other's file"
+    refused(sentence, *COMMANDS[command], *HUSKY)
+
+
 def test_a_run_that_was_taken_as_it_is_is_stated_and_no_longer_refused(terrain, in_g, model_dir):
     """``--repair`` is the one option, of every command; what it decided stays with the run."""
     assert terrain("convert", "data", "--out", "runs", "--repair")[0] == 0

@@ -12,6 +12,7 @@ import pytest
 
 from pipelines.data.datasets import verdict, verdicts_of
 from terrain.kinematics.logged_wheels import with_wheel_speeds
+from terrain.records import Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 
@@ -59,6 +60,17 @@ def exchanged(stream, *pairs):
             new[a], new[b] = b, a
         values = old.columns([new[name] for name in old.channels])
         return replace(run, streams={**run.streams, stream: replace(old, values=values)})
+
+    return change
+
+
+def without(stream, channel):
+    def change(run):
+        old = run.streams[stream]
+        kept = [name for name in old.channels if name != channel]
+        return replace(
+            run, streams={**run.streams, stream: Stream(old.time_s, old.columns(kept), tuple(kept))}
+        )
 
     return change
 
@@ -139,6 +151,9 @@ PLANTED = [
     ("orchard_ugv", shifted("pose", "yaw_rad", np.pi / 2), BAD, "a yaw off by 90 degrees?"),
     ("orchard_ugv", shifted("pose", "yaw_rad", np.pi), BAD, "a yaw off by 180 degrees?"),
     ("orchard_ugv", exchanged("gnss", *NORTH), BAD, "x and y exchanged (x is east, y north)"),
+    ("orchard_ugv", exchanged("gnss", NORTH[0]), BAD, "latitude and longitude exchanged?"),
+    ("orchard_ugv", scaled("gnss", -1.0, "velocity_x"), BAD, "a course that is not from north, clockwise"),
+    ("husky", without("wheels", "speed_right_mps"), ODD, "'wheels' lacks speed_right_mps"),
     ("orchard_ugv", scaled("gnss", 1 / 111_000.0, "position"), BAD, "in degrees?"),
     ("orchard_ugv", scaled("gnss", 1e3, "position"), BAD, "mm?"),
     ("orchard_ugv", scaled("gnss", 3.6, "velocity"), BAD, "km/h?"),
