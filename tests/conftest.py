@@ -4,7 +4,7 @@ import csv
 import os
 import sys
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -90,6 +90,15 @@ def measured():
         return folder / name
 
     return there
+
+
+@pytest.fixture(scope="session")
+def measured_runs(measured):
+    """Return a function that gives the runs of a folder of measured logs, each read once."""
+    from pipelines.data.datasets import load_runs
+
+    read = cache(lambda folder, robot: load_runs(measured(folder), robot=robot))
+    return lambda folder, robot=None: read(folder, robot)
 
 
 @pytest.fixture(scope="session")

@@ -21,7 +21,7 @@ def folders(a_run, tmp_path_factory):
 def test_what_changed_to_the_other_folder_stands_first_and_in_json(terrain, folders, place):
     first, second = folders
     words = ("explain", "--data", first, "--against", second, "--robot", "husky", "--out", "compared")
-    code, out, err = terrain(*words, "--json", "compared.json")
+    code, out, err = terrain(*words, "--effects", "camera_yaw,wheel_radius", "--json", "compared.json")
     assert code == 0, err
     against = json.loads((place / "compared.json").read_text())["against"]
     (changed,) = against["differences"]

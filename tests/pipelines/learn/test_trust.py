@@ -1,8 +1,10 @@
 """Code of one's own is run by a model only where its module was trusted by name."""
 
 import json
+import shutil
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -58,12 +60,25 @@ def field(tmp_path, monkeypatch):
     forget()
 
 
-@pytest.fixture
-def saved(field, windows, tmp_path):
+@pytest.fixture(scope="module")
+def fitted(windows, tmp_path_factory):
     """A model with an estimator, a function and an object of the module, and its probabilities."""
-    functions = (load_named("field_code:roughness"), load_named("field_code:Peak")("gyro_x_radps"))
-    model = TerrainClassifier(load_named("field_code:Nearest")(), functions=functions).fit(windows)
-    return model.save(tmp_path / "model"), model.predict_proba(windows)
+    place = tmp_path_factory.mktemp("fitted")
+    (place / "field_code.py").write_text(FIELD, encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        patch.setattr(sys, "path", [*sys.path])
+        patch.setattr(sys, "dont_write_bytecode", True)
+        functions = (load_named("field_code:roughness"), load_named("field_code:Peak")("gyro_x_radps"))
+        model = TerrainClassifier(load_named("field_code:Nearest")(), functions=functions).fit(windows)
+        return model.save(place / "model"), model.predict_proba(windows)
+
+
+@pytest.fixture
+def saved(fitted, field, tmp_path):
+    """That model beside a module of the test's own, and its probabilities."""
+    load_named("field_code:Nearest")
+    return Path(shutil.copytree(fitted[0], tmp_path / "model")), fitted[1]
 
 
 def test_nothing_is_imported_until_the_module_is_trusted_and_then_all_is_the_same(field, saved, windows):

@@ -303,12 +303,10 @@ def test_without_turns_or_gyro_it_is_unknown_and_not_zero():
 
 
 @pytest.mark.parametrize("name", ["warthog", "marmotte"])
-def test_what_the_package_states_is_what_measured_logs_show(measured, name):
+def test_what_the_package_states_is_what_measured_logs_show(measured_runs, name):
     folder = {"warthog": "drive_warthog_terrains", "marmotte": "drive_marmotte"}[name]
     robot = load_robot(name)
-    runs = [
-        run for run in load_runs(measured(folder), robot=name) if not {"sand", "gravel"} & set(run.terrains)
-    ]
+    runs = [run for run in measured_runs(folder, robot=name) if not {"sand", "gravel"} & set(run.terrains)]
     found = by_name(motion_findings(runs, robot, ("asphalt",)))
     for number, stated in robot.identified.items():
         half = (found[number].high - found[number].low) / 2

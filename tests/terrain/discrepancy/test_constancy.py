@@ -30,6 +30,7 @@ from terrain.discrepancy.verdict import Tier
 from terrain.effects import PARAMETERS, effect_named
 from terrain.robots import load_robot
 
+pytestmark = pytest.mark.usefixtures("without_next_drive")
 NAMES = ("payload_ratio", "gyro_bias_radps")
 N_RUNS, N_ROWS, SIZE = 8, 120, 0.2
 SIMULATION = simulation_of(load_robot("husky"))

@@ -18,6 +18,7 @@ from terrain.effects import CHANNELS, effect_named
 from terrain.records import Stream
 from terrain.robots import load_robot
 
+pytestmark = pytest.mark.usefixtures("without_next_drive")
 HUSKY = load_robot("husky")
 FEW = tuple(map(effect_named, ("camera_yaw", "lever_arm", "gyro_scale", "effective_track", "wheel_radius")))
 YAW = {"camera_yaw_rad": 0.05}
@@ -38,6 +39,12 @@ def turned(hide):
     return hide(YAW, n=8, duration_s=20.0)
 
 
+@pytest.fixture(scope="module")
+def right(turned, without_next_drive):
+    """What is found in them."""
+    return diagnosed(turned)
+
+
 def planted(hide, name, value):
     """Return runs of which those that are held out have the opposite of what the others have."""
     runs, other = (hide({name: sign * value}, n=8, duration_s=20.0) for sign in (1, -1))
@@ -45,8 +52,7 @@ def planted(hide, name, value):
     return [there if run.run_id in ids else run for run, there in zip(runs, other, strict=True)]
 
 
-def test_what_fits_the_runs_used_and_not_those_held_out_is_a_candidate_and_builds_nothing_in(hide, turned):
-    right = diagnosed(turned)
+def test_what_fits_the_runs_used_and_not_those_held_out_is_a_candidate_and_builds_nothing_in(hide, right):
     assert [cause.name for cause in right.diagnosis.causes] == ["camera_yaw"]
     assert right.diagnosis.verdict is Tier.NAMED
     wrong = diagnosed(planted(hide, "camera_yaw_rad", 0.05))
@@ -96,13 +102,12 @@ def test_a_set_extends_the_simulation_by_its_best_member_and_gains(hide):
     assert held_out_gain(found, HUSKY, 0).gain.ci[0] > 0.0
 
 
-def test_parts_of_few_runs_are_left_out_in_turn_and_what_was_built_in_gains_on_all(turned):
+def test_parts_of_few_runs_are_left_out_in_turn_and_what_was_built_in_gains_on_all(turned, right):
     few = turned[:4]
     by_parts = diagnose(few, diagnosed(few, None).simulation, FEW)
     assert [cause.name for cause in by_parts.causes] == ["camera_yaw"]
     assert by_parts.gain.how == "4 runs, runs of them left out of the fit in turn"
-    held = diagnosed(turned)
-    ahead, beside = (d.gain.channels["speed_y_mps"].reduction for d in (by_parts, held.diagnosis))
+    ahead, beside = (d.gain.channels["speed_y_mps"].reduction for d in (by_parts, right.diagnosis))
     assert ahead == pytest.approx(beside, abs=0.1)
     effects = dict(YAW)
     extended = replace(HUSKY, effects=effects, effects_cov=np.array([[1e-6]]))
@@ -111,7 +116,7 @@ def test_parts_of_few_runs_are_left_out_in_turn_and_what_was_built_in_gains_on_a
     gain = held_out_gain(again, extended, 0).built_in_before
     assert len(gain.runs) == 4
     assert gain.channels["speed_y_mps"].reduction == pytest.approx(ahead, abs=0.1)
-    assert held_out_gain(held, HUSKY, 0).built_in_before is None
+    assert held_out_gain(right, HUSKY, 0).built_in_before is None
 
 
 def test_sessions_are_held_out_and_a_run_that_cannot_be_compared_is_excluded_with_its_reason(turned):
@@ -130,17 +135,17 @@ def test_sessions_are_held_out_and_a_run_that_cannot_be_compared_is_excluded_wit
     ("reduction", "learner", "expected"),
     [(0.5, 0.9, True), (0.4, 0.9, False), (-0.1, -0.9, False), (0.2, -0.9, True)],
 )
-def test_a_gain_is_earned_above_0_and_by_half_of_the_learners(turned, reduction, learner, expected):
-    gain = diagnosed(turned).diagnosis.gain._replace(reduction=reduction, learner_reduction=learner)
+def test_a_gain_is_earned_above_0_and_by_half_of_the_learners(right, reduction, learner, expected):
+    gain = right.diagnosis.gain._replace(reduction=reduction, learner_reduction=learner)
     assert gain_module.earned(gain) is expected
 
 
 @pytest.mark.parametrize(("others", "is_named"), [(20.0, True), (5.0, False)])
 def test_a_channel_made_slightly_worse_speaks_against_a_cause_that_removes_little_elsewhere(
-    turned, monkeypatch, others, is_named
+    turned, right, monkeypatch, others, is_named
 ):
     """The cause adds 5 % to the square of the currents, over the noise, and removes some times that elsewhere."""
-    simulation = diagnosed(turned).simulation
+    simulation = right.simulation
     found = find_causes(turned, simulation, FEW)
     on = crossed_runs(found.problem.signals, simulation, found.problem.low_pass, found.noise, 0)
     assert judge(found.fit, found.built_in, on).reasons == {}
@@ -162,8 +167,9 @@ def test_a_channel_made_slightly_worse_speaks_against_a_cause_that_removes_littl
         assert "it makes sum of the motor currents worse, by 5 % of its square" in reasons["camera_yaw"]
 
 
-def judged_on_held_out(runs):
-    """Return the fit to the runs used, what is built in, and the runs held out."""
+@pytest.fixture(scope="module")
+def on_held_out(turned, without_next_drive):
+    """The fit to the runs used, what is built in, and the runs held out."""
     asked = {}
 
     def keep(*about):
@@ -172,13 +178,13 @@ def judged_on_held_out(runs):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(diagnose_module, "judge", keep)
-        diagnosed(runs)
+        diagnosed(turned)
     return asked["about"]
 
 
 @pytest.mark.parametrize("over", [1.0, 2.0, -1.0])
-def test_how_much_likelier_runs_are_follows_from_how_much_of_a_value_they_have(turned, over):
-    fit, built, on = judged_on_held_out(turned)
+def test_how_much_likelier_runs_are_follows_from_how_much_of_a_value_they_have(on_held_out, over):
+    fit, built, on = on_held_out
     names, values = [cause.name for cause in built], [{"camera_yaw_rad": 0.05 * over}]
     likelier, (low, high) = likelier_with(on.evidence(fit), values, [{}], on, on.plain)
     assert names == ["camera_yaw"]
@@ -190,12 +196,11 @@ def test_how_much_likelier_runs_are_follows_from_how_much_of_a_value_they_have(t
     ("likelier", "low", "is_named"), [(0.5, -0.5, True), (0.5, -1.5, False), (-0.1, -0.5, False)]
 )
 def test_of_causes_that_few_runs_confirm_together_one_goes_that_they_do_not_show(
-    turned, monkeypatch, likelier, low, is_named
+    on_held_out, monkeypatch, likelier, low, is_named
 ):
-    about = judged_on_held_out(turned)
     answers = iter([(0.9, (0.5, 1.3)), (likelier, (low, 1.5))])  # of all causes, then of one
     monkeypatch.setattr(earned, "likelier_with", lambda *_: next(answers))
-    assert (judge(*about).reasons == {}) is is_named
+    assert (judge(*on_held_out).reasons == {}) is is_named
 
 
 def test_no_more_than_all_of_a_square_is_removed():

@@ -13,7 +13,6 @@ from numpy.testing import assert_allclose
 from studies.blind_trials.drives import rich_drives
 from studies.blind_trials.trial import hidden_runs, simulation_of, with_late_streams
 
-from pipelines.data.datasets import load_runs
 from terrain.discrepancy.clocks import latencies_of, shifts_of
 from terrain.discrepancy.health.agreement import (
     AMPS,
@@ -881,8 +880,8 @@ def test_a_channel_that_holds_its_largest_value_is_not_at_the_end_of_a_range_whe
 
 
 @pytest.mark.parametrize("folder", ["drive_husky", "borealtc", "vulpi"])
-def test_measured_huskies_have_no_fault_and_what_is_late_or_stuck_is_found(measured, folder):
-    runs = load_runs(measured(folder))
+def test_measured_huskies_have_no_fault_and_what_is_late_or_stuck_is_found(measured_runs, folder):
+    runs = measured_runs(folder)
     lags = latencies(runs)
     assert faults(on_one_clock(runs), lags=lags) == ()
     if folder == "drive_husky":

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.data.datasets import load_runs
 from terrain.discrepancy.runs import in_order
 from terrain.discrepancy.watch import (
     BESIDE,
@@ -253,8 +252,8 @@ DRIVE_HUSKY = {
 }
 
 
-def test_measured_runs_agree_with_what_others_of_them_show_and_a_changed_gyro_departs(measured):
-    runs = in_order(load_runs(measured("drive_husky")))
+def test_measured_runs_agree_with_what_others_of_them_show_and_a_changed_gyro_departs(measured_runs):
+    runs = in_order(measured_runs("drive_husky"))
     robot = replace(HUSKY, effects=DRIVE_HUSKY, effects_cov=np.full((4, 4), np.nan))
     held_out = runs[3::4]
     watched = watched_on([run for run in runs if run not in held_out], robot, "three quarters of the runs")
