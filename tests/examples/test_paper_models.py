@@ -2,7 +2,6 @@
 (``test_papers``)."""
 
 import math
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -11,9 +10,9 @@ from multi_model import Gains, MultiModel
 from scipy.integrate import quad
 from scipy.linalg import expm
 from stiffness import StiffnessLevel, cost_matrix, least_cost_class, response_of
-from tracked_speed import TrackSpeedSettings, TrackSpeedStatus, check_track_speed, track_speed_step
-from tracked_stability import disturbance_bound, error_matrix, measured_efficiency, regressor
-from tracks import janosi_slip, shear_of_ratio, straight_slip_line, track_balance
+from tracked_speed import TrackSpeedSettings, TrackSpeedStatus, track_speed_step
+from tracked_stability import disturbance_bound, error_matrix, regressor
+from tracks import janosi_slip, shear_of_ratio, track_balance
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
@@ -27,14 +26,6 @@ from terrain.terramechanics.traction import bekker_pressure, janosi_force, mobil
 # -- Stiffness of the ground: costs of confusing its levels, and the order of soils (Danzi)
 
 SOFT, FIRM, HARD = StiffnessLevel
-
-
-@pytest.mark.parametrize("within", [0.0, 0.25, 1.0])
-def test_costs_grow_with_the_distance_in_stiffness(within):
-    cost = cost_matrix([SOFT, SOFT, FIRM, HARD], within)
-    assert np.array_equal(cost, cost.T)
-    assert np.all(np.diag(cost) == 0)
-    assert within == cost[0, 1] <= cost[0, 2] <= cost[0, 3] == 1.0
 
 
 def test_the_decision_of_least_cost_has_the_least_cost_of_all_decisions():
@@ -135,39 +126,6 @@ def test_too_fast_a_motion_keeps_its_curvature():
     assert status == TrackSpeedStatus.SATURATED
 
 
-def test_an_estimate_is_used_as_far_as_it_is_known():
-    settled = {"dt_s": 0.5, "used": [0.8, 0.8]}
-    slow = replace(SETTINGS, eta_rate_ps=10.0)
-    used = [command([0.8, 0.8], np.full(2, std), settings=slow, **settled).eta[0] for std in (0.0, 0.2, 1e3)]
-    np.testing.assert_allclose(used, [0.8, 0.9, 1.0], atol=1e-6)
-    unknown = command([np.nan, 0.8], settings=slow, **settled)
-    assert unknown.eta[0] == 1.0
-    assert unknown.status == TrackSpeedStatus.UNESTIMATED
-
-
-def test_limits_of_the_compensation_and_of_its_settings():
-    floored = command([0.1, 1.0], used=[0.3, 1.0])
-    assert (floored.eta[0], floored.status) == (0.3, TrackSpeedStatus.FLOORED)
-    np.testing.assert_allclose(command([0.6, 1.0], used=ONES).eta, [1 - 0.2 * DT_S, 1.0])
-    for name, value, message in (
-        ("eta_rate_ps", 0.0, "eta_rate_ps is 0"),
-        ("eta_floor_ratio", 1.5, "at most 1"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            check_track_speed(replace(SETTINGS, **{name: value}))
-
-
-def test_whatever_comes_in_the_speeds_are_finite_and_within_limits():
-    rng, strange = np.random.default_rng(0), [math.nan, math.inf, -math.inf, 0.0, -1.0, 1e308, 0.5, 1e-320]
-    for _ in range(1000):
-        forward, turn, dt_s = rng.choice(strange, 3)
-        found = command(
-            rng.choice(strange, 2), rng.choice(strange, 2), forward, turn, rng.choice(strange, 2), dt_s
-        )
-        assert max(abs(found.left_mps), abs(found.right_mps)) <= 1.5 * (1 + 1e-12)
-        assert np.isfinite(found.eta).all() or found.status == TrackSpeedStatus.BAD_INPUT
-
-
 # -- Excitation and the bound of Remark 1 (Tazzari et al.)
 
 HALF_TRACK_M = 0.5
@@ -199,18 +157,6 @@ def test_disturbances_stay_within_the_bound(speeds, gain):
             assert np.linalg.norm(x) <= decayed + bound.disturbance_s
 
 
-def test_a_bound_needs_excitation_and_equal_gains():
-    with pytest.raises(ConfigError, match="does not converge"):
-        disturbance_bound(error_matrix(regressor(0, 0.6, 0.0, HALF_TRACK_M), np.ones(3), np.eye(2), 0.1))
-    with pytest.raises(ConfigError, match="equal ones are required"):
-        error_matrix(np.zeros((3, 2)), np.array([1.0, 2.0, 1.0]), np.eye(2), 0.0)
-
-
-def test_efficiency_is_unknown_of_a_track_that_stands():
-    eta = measured_efficiency(0.46, 0.04, [0.4, 0.04], 0.6, HALF_TRACK_M)
-    np.testing.assert_allclose(eta, [[1.1, 0.8], [np.nan, 0.8]])
-
-
 # -- Forces on a tracked robot on a grade (Yamauchi et al.)
 
 PATAKO = load_robot("patako")
@@ -232,15 +178,6 @@ def test_the_thrust_is_the_integral_of_the_shear_stress(grade):
         found.sinkage_m,
     )
     assert found.compaction_n == pytest.approx(2 * 0.15 * rut[0], rel=1e-6)
-
-
-def test_small_slip_is_the_line_and_large_slip_lies_above_it():
-    intercept, slope = straight_slip_line(PATAKO, SAND)
-    for grade in (0.001, 0.02):
-        assert track_balance(PATAKO, SAND, grade).slip_ratio == pytest.approx(
-            intercept + slope * grade, rel=0.08
-        )
-    assert track_balance(PATAKO, SAND, 0.4).slip_ratio > 1.3 * (intercept + slope * 0.4)
 
 
 def test_beyond_reach_there_is_no_slip_and_hard_ground_is_refused():

@@ -25,7 +25,6 @@ STUDIES = {
     "labels": "what chosen questions and self-training gain, from few labels",
     "foreign": "hide effects in simulators of other equations, and in MuJoCo, explain them, count",
     "trials": "hide effects in simulated runs, diagnose them blindly, count what is right",
-    "real-sets": "what explain states of measured sets under each label, and what it gains",
     "watching": "false alarms of serve --watch on measured runs held out, and changes written into them",
     "ablation": "what each signal set is worth to the classifier, on all labelled sets",
     "live": "latency of the live chain by stage, and of the service with many robots",

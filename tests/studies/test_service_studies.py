@@ -1,15 +1,13 @@
 """The studies of the live service measure what they say, and the soak finds what is not accepted."""
 
-import asyncio
 import json
-import time
 
 import msgpack
 import numpy as np
 import pytest
 
 from studies import live, soak
-from studies.service import Packed, messages_of, model_folder, sent_channels, study_drive
+from studies.service import messages_of, model_folder, sent_channels, study_drive
 
 
 @pytest.fixture(scope="module")
@@ -83,43 +81,3 @@ def test_what_is_not_accepted_is_named(changed, problem):
     assert list(judged.problems) == ([problem] if problem else [])
     assert judged.refused == problem
     assert problem in judged.report.answer
-
-
-COMMAND = {"wheel_radps": [0.0], "steer_rad": [0.0], "twist": [0.0], "valid_s": 1.0}
-
-
-def robot_of(*times_s):
-    messages = [Packed(b"", time_s, True, 1) for time_s in times_s]
-    return soak._Robot(2, {"imu": ["gyro_z_radps"]}, messages, soak._Seen(), 0)
-
-
-@pytest.mark.parametrize(("end_s", "n"), [(2005.0, 0), (5.0, 1), (3005.0, 1)])
-def test_a_window_by_another_robots_clock_is_one_of_another_robot(end_s, n):
-    robot = robot_of(2000.0, 2040.0)
-    answer = {"command": COMMAND, "observation": {"window": {"start_s": end_s - 2.0, "end_s": end_s}}}
-    robot._judge(answer, time.monotonic())
-    assert (robot._seen.steps, robot._seen.wrong_session) == (1, n)
-
-
-@pytest.mark.parametrize(
-    ("answers", "steps", "unanswered"),
-    [(["step 1", "step 2"], 1, 0), (["too-fast", "step 2"], 1, 0), (["too-fast"], 0, 0), (["step 1"], 0, 1)],
-)
-def test_an_answer_is_that_of_its_request(monkeypatch, answers, steps, unanswered):
-    monkeypatch.setattr(soak, "ANSWER_S", 0.05)
-    monkeypatch.setattr(soak, "DROPPED_S", 0.05)
-    answers = list(answers)
-
-    class Socket:
-        async def recv(self):
-            if not answers:
-                await asyncio.sleep(1.0)
-            what = answers.pop(0)
-            if what == "too-fast":
-                return msgpack.packb({"type": "error", "code": what, "fatal": False})
-            step = {"type": "step", "time_s": float(what[-1]), "command": COMMAND}
-            return msgpack.packb({**step, "observation": {"window": None}})
-
-    robot = robot_of(0.0)
-    asyncio.run(robot._answer(Socket(), 2.0, time.monotonic()))
-    assert (robot._seen.steps, robot._seen.unanswered) == (steps, unanswered)

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from studies.real_sets import whole_rows
 
 from pipelines.explain.explanation import five_questions
 from pipelines.explain.figures import dependence_figures, parts_figure, run_figure, spectra_figure
@@ -252,14 +251,3 @@ def test_figures_show_the_residual_before_and_after_with_the_band_about_the_exte
     (value,) = few.diagnosis.causes[0].parameters
     assert (band.low[0], band.high[0]) == (value.low, value.high)
     assert points.low[0] < value.value < points.high[0]
-
-
-def test_the_study_of_measured_sets_states_gains_and_coverage_of_runs_held_out_alone(few):
-    """The gain with terms is that of the names where none is learned."""
-    rows = whole_rows("a set", "none", [few.diagnosed] * 2)
-    assert not few.diagnosed.learned or [row.channel for row in rows][-1] == "all"
-    for row in rows:
-        assert row.gain == pytest.approx(row.named_gain) or row.says
-        assert row.channel == "all" or row.coverage > 0.8
-    for row in whole_rows("a set", "none", [replace(few.diagnosed, whole=())]):
-        assert np.isnan(row.coverage)

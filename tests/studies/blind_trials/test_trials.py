@@ -11,7 +11,6 @@ from scipy.stats import norm
 
 from studies.blind_trials.drives import (
     CAR_MPS2,
-    LEAD_S,
     STEP_HZ,
     car_drives,
     command_drives,
@@ -22,7 +21,6 @@ from studies.blind_trials.limits import POWER, TEST_SIZE, Limits, limits_of
 from studies.blind_trials.scoring import table_of
 from studies.blind_trials.trial import (
     CREEP_RATIO,
-    GROSS,
     KNOWN,
     N_STALLED,
     SHORT_RUNS,
@@ -37,7 +35,6 @@ from studies.blind_trials.trial import (
     Row,
     as_command_log,
     cases_of,
-    dynamic_runs,
     faults_of,
     hidden_runs,
     run_trial,
@@ -50,7 +47,6 @@ from terrain.discrepancy.evidence import Z_EFFECT
 from terrain.discrepancy.verdict import Tier
 from terrain.effects import effect_named, library_of
 from terrain.errors import DataError
-from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.robots import load_robot
 
 HUSKY, AGRIMARO, CAR = map(load_robot, ("husky", "agrimaro", "adap2e"))
@@ -118,22 +114,6 @@ def test_the_same_seed_gives_the_same_trial_and_nothing_of_the_truth_leaks(row):
     assert len({run.run_id for run in made.runs}) == len(made.runs)
 
 
-@pytest.mark.slow
-def test_gross_effects_are_20_to_100_times_their_limit_unless_that_is_beyond_the_bounds():
-    clipped = []
-    for number in range(8):
-        made = stage(Row.GROSS, number)
-        assert GROSS[0] <= made.hidden.over_limit <= GROSS[1]
-        effect = effect_named(made.hidden.causes[0])
-        values = np.array([made.hidden.effects[p.name] for p in effect.parameters])
-        low, high = np.array([p.plausible for p in effect.parameters]).T
-        assert ((values >= 0.9 * low) & (values <= 0.9 * high)).all()
-        reached = np.linalg.norm(values) / made.limits.of(effect, values / np.linalg.norm(values))
-        assert made.asked["clipped"] == (reached < 0.999 * made.hidden.over_limit)
-        clipped.append(made.asked["clipped"])
-    assert len(set(clipped)) == 2
-
-
 def test_short_runs_are_commands_of_6_s_in_the_drive_layout():
     assert {case.n_runs for case in cases_of(Row.SHORT, 2, 0, 4)} == {SHORT_RUNS}
     runs = stage(Row.SHORT, 0, n_runs=16).runs
@@ -174,18 +154,6 @@ def test_a_late_logger_or_sensor_is_late_by_what_is_stated_and_no_other_is():
         assert made.hidden.causes[0].endswith("_latency")
 
 
-@pytest.mark.slow
-def test_scatter_has_the_size_that_is_stated():
-    """The track of a run is measured: the slope of its gyro over the turn of its wheels."""
-    made = stage(Row.SCATTERED, 1, n_runs=40)
-    ratio = float(made.asked["variant"].rstrip("%")) / 100
-    assert 0.1 <= ratio <= 0.35
-    slopes = [slope(on_clock(run, "wheels", turn), on_clock(run, "imu", gyro)) for run in made.runs]
-    expected = math.sqrt(math.log(1 + ratio**2))
-    assert np.std(np.log(slopes)) == pytest.approx(expected, rel=0.4)  # 3 standard deviations of 40 runs
-    assert made.asked["accepted"] == (TRACK,)
-
-
 @pytest.mark.parametrize("number", [0, 1])
 def test_stalled_runs_do_not_move_and_their_wheels_turn(number):
     made = stage(Row.STALLED, number)
@@ -214,20 +182,6 @@ def test_half_of_the_runs_have_the_effect_and_the_others_have_none(monkeypatch):
         pairs = [(stream, plain.streams[name]) for name, stream in run.streams.items()]
         alike = [np.array_equal(a.values, b.values) and np.array_equal(a.time_s, b.time_s) for a, b in pairs]
         assert all(alike) == (run.run_id not in present)
-
-
-def test_a_larger_wheel_carries_the_dynamic_robot_further():
-    travelled = []
-    for effects in ({}, {"wheel_radius_ratio": 0.03}):
-        (run,) = (
-            with_wheel_speeds(r, AGRIMARO) for r in dynamic_runs(AGRIMARO, "starts", False, 7, 1, effects)
-        )
-        seen, wheels = run.streams["odometry"], run.streams["wheels"]
-        assert "truth" not in run.streams
-        path = np.column_stack([seen.channel(f"position_{axis}_m") for axis in "xy"])[::40]
-        rolled = np.trapezoid(np.abs(wheels.channel("speed_1_mps")), wheels.time_s)
-        travelled.append(np.hypot(*np.diff(path, axis=0).T).sum() / rolled)
-    assert travelled[1] / travelled[0] == pytest.approx(1.03, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -306,19 +260,6 @@ def test_limits_fall_with_more_runs_and_rise_where_little_is_driven(world):
     own = np.diag(limits.part(lever, lever))
     along = limits.of(lever, np.array([0.0, 1.0]))
     assert along / limits.of(lever) == pytest.approx(math.sqrt(own[0] / own[1]))
-
-
-def test_a_clock_that_drifts_starts_with_the_log():
-    """Of a log that begins two seconds into a drive, the first stamps of both loggers agree."""
-    rate, drives = 0.02, command_drives(np.random.default_rng(0), HUSKY, 1)
-    plain, drifting = (
-        hidden_runs(HUSKY, drives, np.random.SeedSequence(1), values)[0].streams["imu"]
-        for values in ({}, {"clock_rate_ratio": rate})
-    )
-    assert drifting.time_s[0] == pytest.approx(plain.time_s[0] - rate * LEAD_S, abs=0.02)
-    # an event is stamped as late as the clock has drifted since the log began
-    event, there = (imu.time_s[np.abs(np.diff(gyro(imu))).argmax()] for imu in (plain, drifting))
-    assert there - event == pytest.approx(rate * event, abs=0.03)
 
 
 # -- Which effects a trial may hide together ---------------------------------------------------------------

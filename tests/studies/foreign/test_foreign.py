@@ -12,8 +12,8 @@ from studies.foreign import physics, scenes, scoring, sensors, trial, worlds
 from studies.foreign.physics import EVERY, G_MPS2, SAMPLE_S, Body, Motion, integrate
 from studies.foreign.scenes import Scene
 from studies.foreign.sensors import Motor, Sensing
-from studies.foreign.trial import Answer, ForeignTrial, Outcome, cases_of, outcome_of
-from studies.foreign.worlds import WORLDS, Driven, driven_by, effects_of, runs_of
+from studies.foreign.trial import Answer, ForeignTrial, Outcome, outcome_of
+from studies.foreign.worlds import WORLDS, driven_by, effects_of, runs_of
 from terrain.effects import LIBRARY, library_of
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
@@ -67,16 +67,6 @@ def test_left_and_right_are_mirror_images():
     np.testing.assert_allclose(right.speed_x_mps, left.speed_x_mps, atol=1e-9)
     np.testing.assert_allclose(right.yaw_rate_radps, -left.yaw_rate_radps, atol=1e-9)
     np.testing.assert_allclose(right.speed_y_mps, -left.speed_y_mps, atol=1e-9)
-
-
-def test_a_smaller_step_gives_the_same_motion(monkeypatch):
-    coarse = moved(SKID, ramp([-0.3, 0.5, -0.3, 0.5]))
-    monkeypatch.setattr(physics, "STEP_S", physics.STEP_S / 2)
-    monkeypatch.setattr(physics, "EVERY", EVERY * 2)
-    circumferential_mps = ramp([-0.3, 0.5, -0.3, 0.5])
-    time_s = np.arange(4 * EVERY * round(1.0 / SAMPLE_S) + 1) * physics.STEP_S / 2
-    fine = moved(SKID, np.minimum(time_s / 0.5, 1.0)[:, None] * circumferential_mps[-1])
-    np.testing.assert_allclose(fine.yaw_rate_radps, coarse.yaw_rate_radps, atol=2e-4)
 
 
 def test_a_skid_steer_robot_turns_less_than_its_track_says():
@@ -206,29 +196,6 @@ def test_values_that_right_names_have_are_of_the_catalogue_and_follow_the_size()
                 np.sign(value) == -np.sign(effect.values(world, -0.02)[name])
                 for name, value in values.items()
             )
-
-
-@pytest.mark.slow
-def test_wheels_that_are_apart_have_a_wider_effective_track():
-    world = WORLDS["plain", "skid"]()
-    wider = effects_of("plain", "skid")[[e.name for e in effects_of("plain", "skid")].index("wheels_apart")]
-    assert 0.0 < wider.values(world, 0.15)["effective_track_ratio"] < 0.15  # the length resists as before
-
-
-def test_trials_take_what_the_catalogue_has_and_what_it_lacks_in_turn():
-    cases = cases_of("plain_skid", 6, 1)
-    names = {each.name for each in library_of("skid_steer")}
-    right = {effect.name: {*effect.right} for effect in effects_of("plain", "skid")}
-    assert [bool(right[case.effect] & names) for case in cases] == [True, False] * 3
-    scenes_effects = [effect.name for effect in effects_of("mujoco", "skid")]
-    assert [case.effect for case in cases_of("mujoco_skid", len(scenes_effects), 1)] == scenes_effects
-    assert {case.world for case in cases_of("nothing", 8, 1)} >= {"skid", "car", "swerve", "omni"}
-
-
-def test_driven_wheels_begin_and_end_at_rest():
-    for place in WORLDS:
-        driven: Driven = driven_by(WORLDS[place](), 1, np.random.default_rng(0), 3.0)
-        assert not driven.rate[0].any()
 
 
 @pytest.mark.skipif(find_spec("mujoco") is None, reason="mujoco is not installed (pip install mujoco)")
