@@ -47,6 +47,7 @@ SEEN = ("slip_ratio", "slip_std", "wheel_speed_mps", "current_a", *MOTION)
 """What an observation has of the estimate of a motion."""
 
 NOT_ESTIMATED = "no filter runs: the model of the terrain takes none, and no robot is described or driven"
+NOT_FOLLOWED = 'the wheels do not do what is commanded, and are left out ("follows": false where another controller drives)'
 
 WINDOW = (
     *("start_s", "end_s", "terrain", "probabilities", "refused", "nearest", "novelty", "supported"),
@@ -357,6 +358,9 @@ class RobotSession:
             )
             for name, channel in (("wheel_speed_mps", "speed_{}_mps"), ("current_a", "current_{}_a")):
                 known[name] = self.inbox.last("wheels", [channel.format(wheel) for wheel in self._wheels])
+        reason = seen.reason if seen is not None else NOT_ESTIMATED
+        if reason and isinstance(self.chain, LivePilot) and self.chain.control.not_followed:
+            reason = NOT_FOLLOWED
         sensors = self.chain.health or self.inbox.health(time_s)
         if math.isnan(time_s):
             sensors = dict.fromkeys(sensors, "lost")
@@ -370,7 +374,7 @@ class RobotSession:
             },
             "target_of": next(iter(target.values())).terrain,
             **known,
-            "slip_unknown": (seen.reason if seen is not None else NOT_ESTIMATED) or None,
+            "slip_unknown": reason or None,
             "sensors": sensors,
             "served": self.served.number,
             "late": self.late or None,

@@ -33,6 +33,8 @@ def format_value(value: Any, form: str = "", unit: str = "") -> str:
     --------
     >>> format_value(0.8134, ".1%"), format_value(-0.25, "+.2f"), format_value(None), format_value(3)
     ('81.3\xa0%', '−0.25', '–', '3')
+    >>> format_value(-0.0004, ".3f"), format_value(-0.0004, "+.3f")
+    ('0.000', '+0.000')
     >>> format_value((0.7236, 0.9079), ".1%"), format_value(0.12648, unit="m/s")
     ('72.4 to 90.8\xa0%', '0.126\xa0m/s')
     """
@@ -55,7 +57,10 @@ def format_value(value: Any, form: str = "", unit: str = "") -> str:
             if isinstance(number, float) and not math.isfinite(number):
                 text = NOT_KNOWN if math.isnan(number) else ("∞" if number > 0 else f"{MINUS}∞")
             elif form:
-                text = f"{number:{form}}".removesuffix("%").replace("-", MINUS)
+                text = f"{number:{form}}".removesuffix("%")
+                if text.startswith("-") and not text.strip("-0."):  # less than half of the last digit below 0
+                    text = f"{abs(number):{form}}".removesuffix("%")
+                text = text.replace("-", MINUS)
             else:
                 text = format_number(number) if isinstance(number, float) else str(number).replace("-", MINUS)
         texts.append(text)

@@ -410,5 +410,5 @@ def report(result: BridgeResult) -> Report:
         answer,
         parts=(Pairs(pairs), Table(columns, rows)) if rows else (Pairs(pairs),),
         details=sections(("Setup", [Pairs(result.pairs("robot", "dbc"))])),
-        next_step="terrain serve --can BUS --json FILE keeps these figures",
+        next_step="terrain serve --can BUS --json FILE",
     )

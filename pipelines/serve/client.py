@@ -42,6 +42,7 @@ class TerrainClient:
     robot : name of its description
     streams : channels of each stream that is sent, in the order of the columns
     control : whether commands are asked for
+    follows : whether the robot does what is commanded, and is compared with it; False where another controller drives
     rate_hz : of the steps that come back; 0 for one at each message that asks for it
     token : that the service requires
     record : whether the session is recorded there
@@ -66,6 +67,7 @@ class TerrainClient:
         streams: Mapping[str, Sequence[str]],
         *,
         control: bool = False,
+        follows: bool = True,
         rate_hz: float = 10.0,
         token: str = "",
         record: bool = False,
@@ -92,7 +94,8 @@ class TerrainClient:
             except (OSError, TimeoutError, InvalidURI, InvalidHandshake, ValueError) as error:
                 raise ServiceError("unreachable", f"{url}: cannot be reached ({error})") from None
             hello = {"type": "hello", "protocol": 2, "session": session, "robot": robot, "control": control}
-            self._send(hello | {"streams": dict(streams), "rate_hz": rate_hz, "record": record})
+            hello |= {"follows": follows, "rate_hz": rate_hz, "record": record}
+            self._send(hello | {"streams": dict(streams)})
             try:
                 self.welcome = decode(self._socket.recv(TIMEOUT_S))
             except (ConnectionClosed, TimeoutError) as error:

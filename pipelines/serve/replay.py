@@ -343,7 +343,7 @@ def report(result: ReplayResult) -> Report:
     if result.watch is not None:
         if result.alarms:
             what = f"--robot {result.runs[0].robot} --model {result.watch} --out OUT"
-            next_step = f"terrain explain --data LOG {what} names what has changed"
+            next_step = f"terrain explain --data LOG {what}"
         elif not result.model:
             next_step = f"terrain serve --watch {result.watch}"
         compared = sum(not block.why for block in result.blocks)

@@ -248,7 +248,7 @@ def report(result: ServiceResult) -> Report:
         answer = (
             f"{plural(done['sessions'], 'session')} of robots served with {result.model or result.watch}."
         )
-        next_step = "terrain convert RECORDINGS --out RUNS makes runs of what was recorded"
+        next_step = "terrain convert RECORDINGS --out RUNS"
         parts.insert(0, Pairs([(name.replace("_", " "), n) for name, n in done.items()]))
     details = sections(("Channels that the model needs", [Pairs(needs)] if needs else []))
     return Report("Service", answer, parts=parts, details=details, next_step=next_step)

@@ -166,9 +166,8 @@ def path_figure(found: ObserverEstimate) -> Figure:
     for name in ("pose", "gnss") if placed else ():
         stream = found.run.streams.get(name)
         if stream is not None and "position_x_m" in stream.channels:
-            marks.append(
-                Points(f"measured ({name})", *stream.columns(["position_x_m", "position_y_m"]).T, colour=4)
-            )
+            x, y = stream.columns(["position_x_m", "position_y_m"]).T
+            marks.append(Points(f"measured ({name})", x, y, colour=4))
             break
     marks.append(Line("estimate", own.real, own.imag, 0))
     if true is not None:

@@ -445,7 +445,9 @@ def mounting(
         run for run in runs if "imu" in run.streams and set(ACCEL) <= set(run.streams["imu"].channels)
     ]
     if not with_accel:
-        return undetermined(MOUNTING, "no run has an accelerometer (stream 'imu', channels 'accel_*_mps2')")
+        return undetermined(
+            MOUNTING, "no run has all of accel_x_mps2, accel_y_mps2 and accel_z_mps2 (stream 'imu')"
+        )
     of_run: dict[str, list[Array]] = {}
     for stretch in rests:
         if stream := stretch.of("imu", ACCEL):

@@ -257,13 +257,14 @@ def learn_surfaces(
     targets, reasons = dict[str, dict[str, SlipTarget]](), dict[str, str]()
     for terrain, slip in slips.items():  # steady slip where it was measured, assumed numbers elsewhere
         targets[terrain] = assumed = _assumed(terrain)
-        reasons[terrain] = NO_PEAK if slip.slip_ratio >= 0.0 else BRAKES
+        # an interval with 0 in it is that of a wheel that hardly slips, whose radius is known to a percent
+        reasons[terrain] = BRAKES if slip.slip_ratio < 0.0 and not slip.interval[1] >= 0.0 else NO_PEAK
         if slip.n_runs < MIN_RUNS:
             reasons[terrain] = FEW_RUNS
         if reasons[terrain] is not NO_PEAK:
             continue
         low, high = slip.interval
-        ratio, std = round(slip.slip_ratio, DIGITS), round(slip.interval_std, DIGITS)
+        ratio, std = max(round(slip.slip_ratio, DIGITS), 0.0), round(slip.interval_std, DIGITS)
         source = (
             f"sessions: {slip.n_sessions}, runs: {slip.n_runs}, measured from outside; {low:.3f} to {high:.3f} "
             f"({slip.interval_of.words})"

@@ -403,6 +403,11 @@ class RobotControl:
         """Drop what was learned of the terrain, balance and floor of the target, as another one is believed."""
         self._state = self._state._replace(balance_ratio=math.nan, floor_ratio=0.0)
 
+    @property
+    def not_followed(self) -> bool:
+        """Whether wheels or steering do not do what is commanded, so that their readings are left out."""
+        return bool(self._actuation.off.any())
+
     def measured(
         self, time_s: float, dt_s: float, readings: dict[str, Reading], seen: LiveEstimate | None
     ) -> None:

@@ -84,11 +84,13 @@ SOURCES: dict[str, tuple[tuple[str, ...], ...]] = {
     "pose": (POSE_CHANNELS,),
     "lidar": (TWIST,),
     "odometry": (CAMERA_CHANNELS[:-1], TWIST[:2]),
-    "gnss": (VELOCITY,),
+    "gnss": (VELOCITY, POSE_CHANNELS[:2]),
 }
 """Streams that measure motion from outside, the most direct first, and the channels of which each needs one set."""
 
 MAX_GAP_S = 0.5  #: Longer without a sample, what was driven meanwhile is not known well enough to be summed
+
+BASE_S = 1.0  #: Over which positions of a receiver are differenced: noise of 2 cm is then 3 cm/s
 
 MAX_SPEED_RATIO, MAX_JUMP_M = 3.0, 0.05
 """A pose that is further from the one before than so many times what the fastest wheel rolled, and this, has
@@ -177,6 +179,30 @@ def _fastest_mps(run: RunLog, robot: Robot) -> float:
     return float(speeds[np.isfinite(speeds)].max(initial=0.0)) * scale or float("inf")
 
 
+def _velocity_of_receiver(stream: Stream) -> Array:
+    """Return the velocity (n, 2) of a receiver; without a measured one the change of its positions over a second.
+
+    That is NaN at gaps, and where positions are of no RTK fix, which a receiver that states its fixes has.
+    """
+    if set(VELOCITY) <= set(stream.channels):
+        return stream.columns(VELOCITY)
+    place = stream.columns(POSE_CHANNELS[:2])
+    known = np.isfinite(place).all(axis=1)
+    if "fix_ratio" in stream.channels:
+        known &= stream.channel("fix_ratio") > 0.5
+    if known.sum() < 2:
+        return np.full(place.shape, np.nan)
+    time_s, place = stream.time_s[known], place[known]
+    ends, there = [], np.ones(len(stream), dtype=bool)
+    for end_s in (stream.time_s - BASE_S / 2, stream.time_s + BASE_S / 2):
+        after = np.clip(np.searchsorted(time_s, end_s), 1, len(time_s) - 1)
+        there &= (
+            (end_s >= time_s[0]) & (end_s <= time_s[-1]) & (time_s[after] - time_s[after - 1] <= MAX_GAP_S)
+        )
+        ends.append(np.column_stack([np.interp(end_s, time_s, column) for column in place.T]))
+    return np.where(there[:, None], (ends[1] - ends[0]) / BASE_S, np.nan)
+
+
 def _twists(run: RunLog, robot: Robot, name: str) -> Array:
     """Return the twists (n, 3) of the body's origin by a stream of speeds."""
     stream, still = run.streams[name], np.zeros(len(run.streams[name]))
@@ -187,7 +213,7 @@ def _twists(run: RunLog, robot: Robot, name: str) -> Array:
                 "drive sideways; poses are needed"
             )
         wheels, imu, turn = run.streams.get("wheels"), run.streams.get("imu"), still
-        ahead = np.hypot(*(stream.channel(channel) for channel in VELOCITY))
+        ahead = np.hypot(*_velocity_of_receiver(stream).T)
         names = [] if wheels is None else [c for c in wheels.channels if c.startswith("speed_")]
         if wheels is not None and names:
             rolled = np.mean([wheels.channel(channel) for channel in names], axis=0)

@@ -229,6 +229,7 @@
     const none = seen.slip_ratio.every((value) => value === null) && !series.slip.some((one) => one.slip.some((value) => value !== null));
     if (none !== byId("slip").hidden) { showSlip(!none); makePlots(); }
     text("slip-none", seen.slip_unknown ? "Slip is not known: " + seen.slip_unknown + "." : "Slip is not known yet.");
+    byId("slip-none").hidden = !none && !seen.slip_unknown;
   }
   function axes() {
     const common = { stroke: variable("--soft"), grid: { stroke: variable("--line"), width: 1 }, ticks: { stroke: variable("--line") } };

@@ -10,7 +10,7 @@ from pipelines.live.chain import CommandStatus
 from pipelines.live.classifying import Classifier
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
-from pipelines.live.session import TWIST_FRESH_S, Hello, RobotSession, Served
+from pipelines.live.session import NOT_FOLLOWED, TWIST_FRESH_S, Hello, RobotSession, Served
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live import CHANNELS
@@ -152,6 +152,21 @@ def test_a_robot_begins_with_its_steering_where_it_is_and_stands_until_that_is_k
     output = session.step(NOW_S + 0.02)
     assert output.status is CommandStatus.OK
     assert np.abs(output.command.steer_rad - [1.4, 1.5, 1.6]).max() < 0.2
+
+
+@pytest.mark.parametrize("follows", [True, False])
+def test_wheels_that_do_not_do_what_is_commanded_are_the_reason_of_an_unknown_slip(follows):
+    streams = {"wheels": ["speed_left_mps", "speed_right_mps"], "imu": ["gyro_z_radps"]}
+    request = Hello(session="h", robot="husky", streams=streams, control=True, follows=follows)
+    session = RobotSession(request, Served(1, None, "", TABLE), load_robot("husky"))
+    for time_s in np.arange(0.0, 4.0, 0.02).tolist():
+        rows = {
+            "wheels": ([time_s], [[1.0, 1.0 + 0.01 * math.sin(50.0 * time_s)]]),
+            "imu": ([time_s], [[0.0]]),
+        }
+        session.put(rows, [0.1, 0.0, 0.0], NOW_S + time_s)
+        step = session.step(NOW_S + time_s)
+    assert (step.observation["slip_unknown"] == NOT_FOLLOWED) == follows
 
 
 @pytest.mark.parametrize("fault", ["raises", {"wheel_radps": math.nan}, {"steer_rad": math.inf}])

@@ -107,6 +107,18 @@ def test_a_receiver_measures_the_slip_of_a_robot_that_cannot_drive_sideways(make
     assert found.source == "gnss"
     np.testing.assert_allclose(found.body_slip, 0.2, atol=0.02)
     np.testing.assert_allclose(found.twist[:, 2], 0.2, atol=1e-9)
+    # its positions alone show the same; those of no RTK fix and what is driven through a gap show nothing
+    place = np.cumsum(velocity, axis=0) * 0.1 + rng.normal(0.0, 0.01, (time_s.size, 2))
+    fix = (time_s < 7.0).astype(float)[:, None]
+    place[time_s >= 7.0] += 1.0
+    gnss = Stream(time_s, np.hstack([place, fix]), ("position_x_m", "position_y_m", "fix_ratio"))
+    gap = (time_s < 2.0) | (time_s > 3.0)
+    gnss = replace(gnss, time_s=time_s[gap], values=gnss.values[gap])
+    placed = measured_slip(RunLog("field", "husky", {**streams, "gnss": gnss}), HUSKY)
+    known = np.isfinite(placed.body_slip)
+    np.testing.assert_allclose(placed.body_slip[known], 0.2, atol=0.04)
+    assert known.any()
+    assert not known[(placed.end_s > 7.0) | ((placed.start_s < 3.0) & (placed.end_s > 2.0))].any()
     run = make_omni_run()
     only = replace(run, streams={"wheels": run.streams["wheels"], "gnss": streams["gnss"]})
     with pytest.raises(DataError, match="has no heading, and robot robotino can drive sideways"):
