@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MAX_LINES = {"terrain": 57_336, "features": 2_680, "pipelines": 20_220, "tests": 51_145}
+MAX_LINES = {"terrain": 57_365, "features": 2_680, "pipelines": 20_227, "tests": 51_172}
 """Lines of Python, docstrings included."""
 
 

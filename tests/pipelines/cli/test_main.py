@@ -53,7 +53,7 @@ def test_a_robot_that_the_user_gives_may_be_a_file(files, terrain):
 def test_from_simulated_logs_to_slip_on_the_command_line(terrain, place):
     words = ("--robot", "agrimaro", "--terrain", "grass", "--scenario", "straight", "--duration", "8")
     code, out, _ = terrain("simulate", *words, "--out", "logs", "--json", "sim.json")
-    assert (code, out) == (0, "1 run of 8 s, written to logs.\nnext: terrain inspect logs\n")
+    assert (code, out) == (0, "1 run of 8 s, written to logs.\nnext: terrain inspect logs --robot agrimaro\n")
     assert json.loads((place / "sim.json").read_text())["run_ids"] == ["grass_straight_01"]
     code, _, err = terrain("simulate", *words, "--out", "logs")
     assert code == 2
