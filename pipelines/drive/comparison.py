@@ -336,7 +336,12 @@ def verdict(result: DriveResult, pairs: Sequence[tuple[str, str]]) -> str:
         parts.append(f"no significant difference: {', '.join(alike)}")
     if len(result.seeds) == 1:
         parts.append("one seed, which gives no interval")
-    return f"{name} compared with {other}: {'; '.join(parts) or 'no metric that both have'}."
+    text = f"{name} compared with {other}: {'; '.join(parts) or 'no metric that both have'}."
+    if other != "ramp" and (name, "ramp") in pairs:  # which travels as far
+        key = compared.shown[0]
+        shown = _difference_text(compared.difference(name, "ramp", key), key)
+        text += f" Compared with ramp: {metric_label(key)[0]} {shown}."
+    return text
 
 
 def _text(name: str, ramp_mps2: float | None) -> str:

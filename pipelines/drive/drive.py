@@ -45,7 +45,8 @@ class DrivenSettings(JobsSettings):
     table: Path | None = setting(None)
     """Table of target slips; by default the packaged one, with --faults one that is learned in simulation."""
     speed_mps: float | None = setting(None, option="--speed", gt=0.0)
-    """Cruising speed in m/s; 1 by default; with --path 3 of car-like robots, of others at most 0.6 of the motors."""
+    """Cruising speed in m/s; 1 by default, of slower robots 0.6 of the motors; with --path 3 of car-like robots, of
+    others at most 0.6 of the motors."""
     seeds: int | None = setting(None, ge=1)
     """Number of seeds: each draws load, soil, tyres and noise; 20 by default, with --faults 1."""
     first_seed: int = setting(0, "First seed.", option="--seed", ge=0)

@@ -33,7 +33,7 @@ from terrain.control.switching import SWITCHING, OutputStatus, TerrainSource
 from terrain.control.traction import TractionStatus
 from terrain.estimation.clocks import Clocks, check_channels, finite_twist
 from terrain.estimation.feed import places_among
-from terrain.estimation.health import SENSORS, Health
+from terrain.estimation.health import Health
 from terrain.estimation.live import CHANNELS, Estimator, LiveEstimate, live_estimator
 from terrain.estimation.models.choice import suitable_filter
 from terrain.extension import correct_live
@@ -148,9 +148,7 @@ class LivePilot(Chain):
     @property
     def health(self) -> dict[str, str]:
         """Health of each sensor at the last step, by name, as those of ``Health`` in small letters."""
-        if len(self.control.health) != len(SENSORS):
-            return {}
-        found = zip(SENSORS, self.control.health, strict=True)
+        found = zip(self.control.sensors, self.control.health, strict=True)
         return {name: Health(status).name.lower() for name, status in found}
 
     def take(self, sample: Sample) -> Step:

@@ -60,6 +60,7 @@ from terrain.errors import ConfigError
 from terrain.estimation.clocks import check_channels
 from terrain.estimation.health import SENSORS, SLIP_SENSORS, SOUND, Health
 from terrain.estimation.live import CHANNELS, LiveEstimate
+from terrain.estimation.stream_health import StreamHealth
 from terrain.kinematics.commands import wheel_motion
 from terrain.kinematics.wheels import in_wheel_frame, point_velocity
 from terrain.records import Array, Command, Reading
@@ -322,7 +323,6 @@ _OF_SLIP = tuple(SENSORS.index(name) for name in SLIP_SENSORS)
 _NAMED_FIRST = (0, 1, 2, 3, 4, 6, 7, 5)
 _GYRO, _SEEN, _SEEN_YAW = (SENSORS.index(name) for name in ("gyro", "camera_speed", "camera_yaw"))
 FRESH_S = 0.5  #: Age of a measured speed over ground up to which a robot counts as slow.
-LOST_S = 0.1  #: Without a sample of the wheels for so long they are lost.
 POSE_STATES = ("position_x_m", "position_y_m", "yaw_rad")  #: Of a filter that path tracking is built on.
 _NOT_TRACKED = TrackReport(math.nan, math.nan, 0.0, TrackStatus.NO_POSE)
 
@@ -379,6 +379,9 @@ class RobotControl:
         if states:
             check_channels("wheels", robot.rate_channels, wheels)
         self._n_columns = len(wheels), len(imu)
+        self._streams = StreamHealth(robot, channels) if states and not self._angles else None
+        #: names of the sensors that are judged
+        self.sensors = SENSORS if self._streams is None else self._streams.names
         self._rates = [wheels.index(channel) for channel in robot.rate_channels if states]
         self._tilt = [imu.index(angle) for angle in ("roll_rad", "pitch_rad") if angle in imu]
         self._gains = thesis_gains(robot) if settings.controller == "thesis" else THESIS_GAINS
@@ -387,7 +390,7 @@ class RobotControl:
             self._turning = turning_of(robot)
         self.use(table)
         # what a step leaves to the next
-        self.health = [0] * len(SENSORS)
+        self.health = [0] * len(self.sensors)
         self.steer_rad = np.zeros(len(robot.wheels))
         self.target_ratio, self._tilt_rad, self._tracking = math.nan, (0.0, 0.0), TrackState()
         self._state, self._pids, self._turn = TractionState(), [WheelPid()] * n, first_state(robot)
@@ -413,8 +416,12 @@ class RobotControl:
     ) -> None:
         """Take what was measured, in the order of the schema, and the estimate before it.
 
-        Rates of motors that do not follow their commands are not to be believed: they are replaced by NaN.
+        Rates of motors that do not follow their commands are not to be believed, nor sensors that are frozen or have
+        jumped: they are replaced by NaN.
         """
+        if self._streams is not None:
+            self._streams.step(time_s, step_or_period(dt_s), readings, seen)
+            self._streams.mask(readings)
         wheels, imu = (
             reading
             if reading is not None and len(values := reading.values) and values.shape[1] == n
@@ -461,7 +468,7 @@ class RobotControl:
         holds : the belief does not age
         """
         step_s = step_or_period(dt_s)
-        sensor, health = self._judge(seen, time_s)
+        sensor, health = self._judge(seen)
         target = self._target(belief.terrain, seen, step_s)
         twist, tracked = self._track(desired, seen, time_s, dt_s)
         twist = self._keep_turn(twist, seen, sound=health <= SOUND, dt_s=dt_s)
@@ -505,7 +512,7 @@ class RobotControl:
             "heading_error_rad": tracked.heading_error_rad,
             "cross_track_m": tracked.cross_track_m,
             "track_status_code": float(tracked.status),  # of path_tracking.TrackStatus
-            "sensor_code": float(sensor),  # place of the least sound in health.SENSORS; -1 for none
+            "sensor_code": float(sensor),  # place of the least sound among those that are judged; -1 for none
             "health_code": float(health),  # its health.Health
             "output_code": float(output),  # of the terrain source, switching.OutputStatus
         }
@@ -581,25 +588,26 @@ class RobotControl:
         driven_mps = float(np.abs(command).max()) * radius_m
         return command, WheelReport(driven_mps, aimed, math.nan, largest, wheels[0].drive_state, status)
 
-    def _judge(self, seen: LiveEstimate | None, time_s: float = math.nan) -> tuple[int, int]:
+    def _judge(self, seen: LiveEstimate | None) -> tuple[int, int]:
         """Update the health of the sensors; return the place of the least sound, or -1, and its health."""
         if not self._estimates:
             return -1, Health.FRESH
-        if seen is None:
+        if self._streams is not None:
+            self.health = list(self._streams.health)
+        elif seen is None:
             self.health = [int(Health.LOST)] * len(SENSORS)
             return 0, Health.LOST
-        self.health = health = seen.health.tolist()
-        if len(health) != len(SENSORS):  # of other drives only wheels are judged: that come, and follow
-            if time_s - seen.time_s > LOST_S:
-                return -1, Health.LOST
-            return -1, Health.DISAGREES if self._actuation.off.any() else Health.FRESH
+        else:
+            self.health = seen.health.tolist()
+        health = self.health
         for i in np.flatnonzero(self._actuation.off).tolist():
             if health[i] == Health.LOST or health[i] < Health.DISAGREES:  # it was taken from the filter
                 health[i] = int(Health.DISAGREES)
-        worst = max(health[i] for i in _OF_SLIP)
+        judged = _OF_SLIP if self._streams is None else range(len(health))
+        worst = max(health[i] for i in judged)
         if worst <= SOUND:
             return -1, worst
-        place = max(_OF_SLIP, key=lambda i: _NAMED_FIRST[health[i]])
+        place = max(judged, key=lambda i: _NAMED_FIRST[health[i]])
         return place, health[place]
 
     def _target(self, terrain: str, seen: LiveEstimate | None, dt_s: float) -> TractionTarget:
@@ -622,7 +630,7 @@ class RobotControl:
         if not self._settings.track or seen is None:
             return twist, _NOT_TRACKED
         is_sound = True
-        if len(self.health) == len(SENSORS):
+        if self._streams is None:
             turns, seen_yaw, camera = (self.health[i] for i in (_GYRO, _SEEN_YAW, _SEEN))
             is_sound = min(turns, seen_yaw) <= SOUND and (camera <= SOUND or camera == Health.LOST)
         ahead, left, yaw = seen.speed_x_mps, seen.speed_y_mps, seen.yaw_rate_radps

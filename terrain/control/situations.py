@@ -23,6 +23,7 @@ from terrain.simulation.scenario import (
     Patch,
     Scenario,
     draw_conditions,
+    fastest_mps_of,
     make_scenario,
 )
 from terrain.simulation.sensors import Gnss
@@ -50,6 +51,19 @@ SITUATIONS = {
 }
 
 
+def usual_speed(robot: Robot) -> float:
+    """Return the speed of a situation by default: 1 m/s, or 0.6 of what motors give that are slower than that.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> [round(usual_speed(load_robot(name)), 2) for name in ("husky", "robotino")]
+    [1.0, 0.56]
+    """
+    limit_mps = fastest_mps_of(robot)
+    return 1.0 if limit_mps >= 1.0 else 0.6 * limit_mps
+
+
 class Situation(NamedTuple):
     """All that a simulated drive needs beside a robot and a controller."""
 
@@ -65,7 +79,7 @@ class SituationOptions:
     """What is chosen of a situation."""
 
     duration_s: float | None = None
-    speed_mps: float = 1.0
+    speed_mps: float | None = None  #: :func:`usual_speed` of the robot by default
     accel_mps2: float = 1.0
     grade_deg: float = 0.0  #: uphill along the initial heading
     radius_factors: tuple[float, float, float] | None = None  #: true over nominal radius; drawn by default
@@ -104,7 +118,8 @@ def make_situation(
         chosen["radius_factors"] = options.radius_factors
     conditions = replace(draw_conditions(rng, robot=robot), **chosen)
     number, names = int(driven.generate_state(1)[0]), list(soils)
-    duration_s, speed_mps, accel_mps2 = options.duration_s, options.speed_mps, options.accel_mps2
+    duration_s, accel_mps2 = options.duration_s, options.accel_mps2
+    speed_mps = usual_speed(robot) if options.speed_mps is None else options.speed_mps
     changes = {"accel_mps2": accel_mps2} if accel_mps2 != 1.0 else {}
     if name == STARTS:
         if duration_s is not None:

@@ -146,6 +146,7 @@ def test_the_report_names_every_controller_and_metric_and_what_is_not_known():
     ):
         assert shown in text
     assert "classified compared" not in result.report.answer
+    assert "Compared with ramp: largest slip" in result.report.answer
     assert len(terminal_text(result.report).splitlines()) <= 25
     assert [panel.marks[0].x for panel in result.report.picture.panels] == [list(names)] * 3
     assert (len(result.to_pandas()), set(result.to_pandas()["controller"])) == (4 * len(names), set(names))

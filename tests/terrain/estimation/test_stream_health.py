@@ -1,0 +1,136 @@
+"""Health of sensors by what comes of their streams: what each fault makes of it, and nothing without one."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from terrain.estimation.health import Health
+from terrain.estimation.stream_health import BELIEVED_S, StreamHealth
+from terrain.kinematics.logged_wheels import sensor_channels
+from terrain.records import Reading
+from terrain.robots import load_robot
+
+ROBOT = load_robot("husky")
+CHANNELS = sensor_channels(ROBOT)
+DT_S, SPEED_MPS, FAULT_S = 0.02, 0.8, 2.0
+EVERY = {"wheels": 1, "imu": 1, "odometry": 2, "gnss": 5}  # steps from sample to sample
+STD = {"speed_x_mps": 0.02, "velocity_x_mps": 0.03, "position_x_m": 0.02, "pitch_rad": 0.01}
+
+
+def judged(change=lambda name, time_s, row: row, length_s=4.0, age_s=lambda time_s: 0.0, seed=0):
+    """The health of each sensor at each step of a steady drive, whose samples ``change`` makes others of, or none."""
+    rng, judge, found = np.random.default_rng(seed), StreamHealth(ROBOT, CHANNELS), []
+    for k in range(round(length_s / DT_S)):
+        time_s, readings = k * DT_S, {}
+        for name, channels in CHANNELS.items():
+            mean = {
+                "speed": SPEED_MPS,
+                "velocity_x": SPEED_MPS,
+                "position_x": SPEED_MPS * time_s,
+                "std": 0.02,
+            }
+            row = np.array([next((v for n, v in mean.items() if c.startswith(n)), 0.0) for c in channels])
+            row = row + [
+                0.0 if c == "std_position_m" else STD.get(c, 0.01) * rng.standard_normal() for c in channels
+            ]
+            row = change(name, time_s, row) if k % EVERY[name] == 0 else None
+            if row is not None:
+                readings[name] = Reading(np.array([time_s]), row[None])
+        motion = {"time_s": time_s, "reference_age_s": age_s(time_s), "speed_x_mps": SPEED_MPS}
+        motion |= {"wheel_speed_mps": np.full(2, 0.9), "accel_x_mps2": 0.1 * rng.standard_normal()}
+        found.append(list(judge.step(time_s, DT_S, readings, SimpleNamespace(**motion))))
+    return dict(zip(judge.names, np.array(found).T, strict=True))
+
+
+def added(stream, channel, amount, until_s=np.inf):
+    """A change by which a channel has another value from the fault on."""
+    place = CHANNELS[stream].index(channel)
+
+    def change(name, time_s, row):
+        if name == stream and FAULT_S <= time_s < until_s:
+            row[place] += amount
+        return row
+
+    return change
+
+
+def frozen(stream):
+    held = {}
+
+    def change(name, time_s, row):
+        if name != stream:
+            return row
+        held[name] = row if time_s < FAULT_S else held[name]
+        return held[name].copy()
+
+    return change
+
+
+SENSORS_OF = {
+    "wheels": ("wheel_left", "wheel_right"),
+    "imu": ("gyro", "accel", "tilt"),
+    "odometry": ("camera_speed",),
+    "gnss": ("gnss_position", "gnss_speed"),
+}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_is_named_without_a_fault(seed):
+    assert all((health == Health.FRESH).all() for health in judged(seed=seed).values())
+
+
+@pytest.mark.parametrize("stream", SENSORS_OF)
+@pytest.mark.parametrize("kind", ["lost", "nan", "frozen"])
+def test_a_dead_stream_is_named_within_three_tenths_of_a_second(stream, kind):
+    gone = {"lost": None, "nan": np.full(len(CHANNELS[stream]), np.nan)}
+    change = frozen(stream)
+    if kind != "frozen":
+        change = lambda name, time_s, row: gone[kind] if name == stream and time_s >= FAULT_S else row  # noqa: E731
+    found = judged(change)
+    named = Health.FROZEN if kind == "frozen" else Health.LOST
+    for name, health in found.items():
+        late = health[round((FAULT_S + 0.3) / DT_S) :]
+        assert (late == (named if name in SENSORS_OF[stream] else Health.FRESH)).all(), name
+
+
+@pytest.mark.parametrize(
+    ("stream", "channel", "amount", "sensor"),
+    [
+        ("odometry", "speed_x_mps", 0.3, "camera_speed"),
+        ("gnss", "velocity_x_mps", -0.3, "gnss_speed"),
+        ("gnss", "position_x_m", 1.0, "gnss_position"),
+        ("imu", "pitch_rad", 0.2, "tilt"),
+    ],
+)
+def test_a_value_that_jumped_is_named_until_it_jumps_back_or_is_believed(stream, channel, amount, sensor):
+    back = judged(added(stream, channel, amount, FAULT_S + 1.0))[sensor]
+    acts = slice(round((FAULT_S + 0.3) / DT_S), round((FAULT_S + 1.0) / DT_S))
+    assert (back[acts] >= Health.DISAGREES).all()
+    assert back[-1] == Health.FRESH
+    stays = judged(added(stream, channel, amount), length_s=FAULT_S + BELIEVED_S + 1.0)[sensor]
+    assert (stays[round((FAULT_S + 0.3) / DT_S) : -60] >= Health.DISAGREES).all()
+    assert stays[-1] == Health.FRESH
+
+
+def test_an_outlier_a_float_solution_and_what_never_came_are_no_faults():
+    def change(name, time_s, row):
+        if name == "odometry":
+            return None
+        if name == "gnss" and time_s >= 2.0:  # half a metre, and stated
+            row[:2] += 0.5 * np.sin(37.0 * time_s)
+            row[CHANNELS["gnss"].index("std_position_m")] = 0.5
+        if name == "imu" and abs(time_s - 1.0) < 1e-9:
+            row[:] = 1e6
+        return row
+
+    for name, health in judged(change).items():
+        assert (health[: round(0.9 / DT_S)] == Health.FRESH).all(), name
+        assert health[-1] == Health.FRESH, name
+        assert (health != Health.FRESH).sum() <= 2, name
+
+
+def test_references_that_the_filter_does_not_believe_are_gated():
+    found = judged(age_s=lambda time_s: max(time_s - 2.0, 0.0))
+    assert all((found[name][-20:] == Health.GATED).all() for name in ("camera_speed", "gnss_speed"))
+    assert (found["gyro"] == Health.FRESH).all()
