@@ -125,13 +125,11 @@ class StreamHealth:
         ]
         for stream, sensors in SENSORS_OF.items():
             for name, own in sensors.items():
-                wanted = own or robot.steer_channels
-                wanted = tuple(name for name in wanted if name in places.get(stream, ()))
-                if wanted and wanted[0] == (own or wanted)[0]:
-                    columns = [places[stream].index(channel) for channel in wanted]
-                    self._sensors.append(
-                        _Sensor(name, stream, columns, *_jump(name, wanted[0]), LOST_AFTER_S)
-                    )
+                named = own or robot.steer_channels
+                named = tuple(name for name in named if name in places.get(stream, ()))
+                if named and named[0] == (own or named)[0]:
+                    columns = [places[stream].index(channel) for channel in named]
+                    self._sensors.append(_Sensor(name, stream, columns, *_jump(name, named[0]), LOST_AFTER_S))
         self.names = tuple(sensor.name for sensor in self._sensors)
         self.health = [int(Health.FRESH)] * len(self.names)
         self._seen = [_Seen() for _ in self.names]
