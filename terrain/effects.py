@@ -422,7 +422,7 @@ def _wheel_columns(block: Block) -> Iterator[tuple[int, float]]:
         quantity, _, rest = channel.partition("_")
         if quantity in ("motor", "speed", "wheel") and rest.rpartition("_")[0] in block.robot.logged_wheels:
             radius_m = 1.0 if quantity == "speed" else block.robot.wheel_radius_m
-            yield i, radius_m / block.robot.motors.reduction_ratio if quantity == "motor" else radius_m
+            yield i, radius_m / block.robot.reduction_ratio if quantity == "motor" else radius_m
 
 
 def _undo_wheel_dead_zone(block: Block, dead_mps: float) -> None:

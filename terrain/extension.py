@@ -222,7 +222,7 @@ def _driven(run: RunLog, robot: Robot) -> tuple[Array, Array, Array]:
         return none, none, grade
     rates = wheels.columns(robot.rate_channels)
     if robot.rate_channels[0].startswith("motor_"):
-        rates = rates * (robot.wheel_radius_m / robot.motors.reduction_ratio)
+        rates = rates * (robot.wheel_radius_m / robot.reduction_ratio)
     directions, speed = robot.wheel_directions_rad, rates.mean(axis=1)
     if robot.steered:
         steering = run.streams.get("steering")
@@ -415,7 +415,7 @@ class Correction:
         if name != "wheels" or not self._terms or not set(robot.rate_channels) <= set(channels):
             return None
         places = [channels.index(channel) for channel in robot.rate_channels]
-        ratio = robot.motors.reduction_ratio if robot.by_motor else 1.0
+        ratio = robot.reduction_ratio if robot.by_motor else 1.0
         speed = values[:, places] * (robot.wheel_radius_m / ratio if robot.by_motor else 1.0)
         inputs = np.zeros((len(values), len(INPUTS)))
         steer = self._steering(time_s, speed)

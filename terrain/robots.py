@@ -469,7 +469,7 @@ class Robot(ABC):
     def logged_rates(self, wheel_speed_mps: Array) -> Array:
         """Return what :attr:`rate_channels` log of wheel circumferential speeds (..., wheels)."""
         if self.by_motor:
-            return np.asarray(wheel_speed_mps / self.wheel_radius_m * self.motors.reduction_ratio)
+            return np.asarray(wheel_speed_mps / self.wheel_radius_m * self.reduction_ratio)
         return np.asarray(wheel_speed_mps)[..., np.isin(self.wheels, self.logged_wheels)]
 
     def wheel_speeds_mps(self, rows: Array) -> Array:
@@ -517,6 +517,11 @@ class Robot(ABC):
                 values[name] = own.get(name, 1.0 if "_scale_" in name else unknown)
             neutral[section] = KIND_OF_SECTION[section](**values)
         return replace(self, parts={**neutral, **self.parts})
+
+    @property
+    def reduction_ratio(self) -> float:
+        """Turns of a motor, as logs have them, a turn of its wheel; 1 where no motors are described."""
+        return self.motors.reduction_ratio if self.describes("motors") else 1.0
 
     def check_geometry(self, place: str) -> None:
         """Refuse dimensions that no body can have; ``place`` is what messages call the robot."""

@@ -286,7 +286,7 @@ def _described(run: RunLog, robot: Robot | None) -> tuple[RunLog, Described]:
 
     try:
         known = robot_named(run.robot, robot)
-        run = with_wheel_speeds(run, known) if known.describes("motors") else run
+        run = with_wheel_speeds(run, known)
     except ConfigError:
         return run, Described()
     fastest_mps = getattr(known, "speed_max_mps", _wheel_rate_max_radps(known) * known.wheel_radius_m)

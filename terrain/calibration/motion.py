@@ -314,7 +314,7 @@ class Log(NamedTuple):
 
 def _laid_out(run: RunLog, robot: Robot, source: str, leg_s: float) -> dict[str, Array] | str:
     """Return the parts of :class:`Log` that a run has; or why it has none, in words."""
-    run = with_wheel_speeds(run, robot) if robot.by_motor and robot.describes("motors") else run
+    run = with_wheel_speeds(run, robot)
     wheels, steering, imu = (run.streams.get(name) for name in ("wheels", "steering", "imu"))
     names = [f"speed_{wheel}_mps" for wheel in robot.logged_wheels]
     if wheels is None or not set(names) <= set(wheels.channels):

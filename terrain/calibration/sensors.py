@@ -107,7 +107,7 @@ def standing(run: RunLog, robot: Robot, min_s: float = MIN_STANDING_S) -> list[S
     )
     quiet &= (np.abs(values[:, :, rates].mean(axis=1)) < MAX_BIAS_RADPS).all(axis=1)
     if wheels is not None:
-        by_rate = robot.wheel_radius_m / robot.motors.reduction_ratio if robot.by_motor else 1.0
+        by_rate = robot.wheel_radius_m / robot.reduction_ratio if robot.by_motor else 1.0
         moving_s = wheels.time_s[np.abs(wheels.values).max(axis=1) * by_rate > STANDING_MPS]
         quiet &= np.searchsorted(moving_s, time_s[:, 0]) == np.searchsorted(moving_s, time_s[:, -1])
         quiet &= (time_s[:, 0] >= wheels.time_s[0]) & (time_s[:, -1] <= wheels.time_s[-1] + BLOCK_S)
@@ -517,7 +517,7 @@ def _speed_changes(run: RunLog, robot: Robot) -> Array | None:
 
 def with_rolled(run: RunLog, robot: Robot) -> tuple[Array, Array] | None:
     """Return stamps (n,) and the twist (n, 3) that the wheels would roll without slip; None without their speeds."""
-    run = with_wheel_speeds(run, robot) if robot.by_motor and robot.describes("motors") else run
+    run = with_wheel_speeds(run, robot)
     speeds = Stretch(run).of("wheels", [f"speed_{wheel}_mps" for wheel in robot.logged_wheels])
     if speeds is None:
         return None

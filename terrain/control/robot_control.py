@@ -373,7 +373,7 @@ class RobotControl:
             check_tracking(robot, self._track_settings, settings.delay_s)
         n, mps_per_rate = len(robot.logged_wheels), 1.0
         if robot.by_motor:
-            mps_per_rate = robot.wheel_radius_m / robot.completed.motors.reduction_ratio
+            mps_per_rate = robot.wheel_radius_m / robot.reduction_ratio
         self._actuation = Actuation(mps_per_rate, n, len(self._angles), robot.skids)
         wheels, imu = (list(channels.get(name, ())) for name in ("wheels", "imu"))
         if states:

@@ -308,7 +308,7 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
             f"{', '.join(robot.logged_wheels)} is required"
         )
     is_motor = names[0].startswith("motor")
-    scale = robot.wheel_radius_m / robot.motors.reduction_ratio if is_motor else 1.0
+    scale = robot.wheel_radius_m / robot.reduction_ratio if is_motor else 1.0
     speeds = wheels.columns(names) * scale
     outside = _outside(run, robot)
 

@@ -509,7 +509,7 @@ class LiveFilter(Live):
             motion = skid.motion_at(time_s, left_mps, right_mps, has_gyro, *known, self._motion)
         else:
             motor_radps = rates
-            wheel_speed_mps = robot.wheel_speeds_mps(rates / robot.motors.reduction_ratio)
+            wheel_speed_mps = robot.wheel_speeds_mps(rates / robot.reduction_ratio)
             speeds, ages_s = robot.wheel_speeds_mps(self._rows[:, : len(robot.wheels)]), np.array([age_s])
             unmeasured_s = time_s - self._feed["received_s"].min(axis=1)
             slips = self._slip(mean[None], filter_.cov[None], speeds, ages_s, unmeasured_s)

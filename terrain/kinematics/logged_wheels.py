@@ -39,10 +39,7 @@ def with_wheel_speeds(run: RunLog, robot: Robot) -> RunLog:
 
     Wheel speeds that are there already are made anew; a run without motor rates comes back as it is.
 
-    Raises
-    ------
-    ConfigError
-        if the run has motor rates and the robot's description no motors.
+    Rates of a robot whose description has no motors are those of its wheels.
 
     Examples
     --------
@@ -99,7 +96,7 @@ def wheel_speeds_from(
     speeds = tuple(f"speed_{wheel}_mps" for wheel in robot.wheels)
     at = [channels.index(motor) for motor in motors]
     others = [i for i, channel in enumerate(channels) if channel not in speeds]
-    ratio, radius_m = robot.motors.reduction_ratio, robot.wheel_radius_m
+    ratio, radius_m = robot.reduction_ratio, robot.wheel_radius_m
 
     def with_speeds(values: Array) -> Array:
         return np.hstack([values[:, others], values[:, at] / ratio * radius_m])
@@ -110,10 +107,10 @@ def wheel_speeds_from(
 def speed_columns(channels: Sequence[str], robot: Robot | None) -> tuple[list[int], float]:
     """Return the columns of wheels that tell how fast they turn, and what makes them speeds in m/s."""
     columns = [i for i, name in enumerate(channels) if name.startswith("speed_")]
-    if columns or robot is None or not robot.describes("motors"):
+    if columns or robot is None:
         return columns, 1.0
     motors = [i for i, name in enumerate(channels) if name.startswith("motor_")]
-    return motors, robot.wheel_radius_m / robot.motors.reduction_ratio
+    return motors, robot.wheel_radius_m / robot.reduction_ratio
 
 
 def wheel_and_ground_speed(truth: Stream, robot: Robot) -> tuple[Array, Array]:

@@ -128,9 +128,12 @@ def _motors(robot: Robot) -> dict[str, float]:
     speed_radps = getattr(robot, "speed_max_mps", speed_mps) / radius_m
     supply_v = 24.0 if robot.mass_kg < HEAVY_KG else 48.0
     gain = FREE_RADPS * robot.body.wheel_inertia_kgm2
+    # a log of rates of motors has those of the wheels where the description has no reduction
+    ratio = MOTOR_RADPS / speed_radps
+    reduction_ratio, behind = (1.0, ratio) if robot.by_motor else (ratio, 1.0)
     return {
-        "reduction_ratio": MOTOR_RADPS / speed_radps,
-        "torque_constant_nmpa": supply_v / (NO_LOAD_RATIO * MOTOR_RADPS),
+        "reduction_ratio": reduction_ratio,
+        "torque_constant_nmpa": behind * supply_v / (NO_LOAD_RATIO * MOTOR_RADPS),
         "efficiency_ratio": 0.75,
         "torque_max_nm": torque_nm,
         "supply_v": supply_v,
@@ -158,8 +161,12 @@ def _steering(robot: Robot) -> dict[str, float]:
 def _sensors(robot: Robot) -> dict[str, float]:
     """Return the numbers of the section ``sensors``."""
     most_a = robot.motors.torque_max_nm / robot.motors.nm_per_a
-    scales = {f"accel_scale_{axis}_ratio": 1.0 for axis in "xyz"}
-    return _INSTRUMENTS | scales | {"current_std_a": CURRENT_STD_RATIO * most_a}
+    own = {f"accel_scale_{axis}_ratio": 1.0 for axis in "xyz"} | {"current_std_a": CURRENT_STD_RATIO * most_a}
+    if robot.by_motor and robot.reduction_ratio == 1.0:  # encoders on motors, stated behind the reduction
+        ratio = MOTOR_RADPS / robot.motors.speed_max_radps
+        own |= {"motor_std_radps": _INSTRUMENTS["motor_std_radps"] / ratio}
+        own |= {"hall_steps_ratio": _INSTRUMENTS["hall_steps_ratio"] * ratio}
+    return _INSTRUMENTS | own
 
 
 _NUMBERS = {"body": _body, "motors": _motors, "steering": _steering, "sensors": _sensors}

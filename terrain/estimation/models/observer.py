@@ -262,9 +262,7 @@ class ObserverFeed(_WithMemory):
             name: wheels.index(rate) for name, rate in zip(names, robot.rate_channels, strict=True)
         }
         self.speeds_mps = np.full(len(self._speeds), math.nan)  # of the logged wheels, at the last tick
-        self.mps_per_rate = (
-            robot.wheel_radius_m / robot.completed.motors.reduction_ratio if robot.by_motor else 1.0
-        )
+        self.mps_per_rate = robot.wheel_radius_m / robot.reduction_ratio if robot.by_motor else 1.0
         self._rows, self._takes_place = rows, "position_x_m" in rows
         self._fixes: dict[str, str] = {}
         for sensor, streams in STREAM_OF_FIX.items():
