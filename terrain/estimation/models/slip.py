@@ -74,8 +74,8 @@ weight in traction, adds; and what turning on the spot does."""
 YIELDING_RATIO = 0.3
 """Length over the radius of a wheel that it rolls from rest until the contact pulls: tyre and soil yield first, a track
 and a gear have slack; d is then of the order of 1."""
-SLOW_RATIO, SLOW_WALK = 0.2, 0.02
-"""Of m at first, about 0, and its walk within a second of driving."""
+SLOW_RATIO, SLOW_WALK = 0.3, 0.02
+"""Of m at first, about 0: on soft ground light robots spin; and its walk within a second of driving."""
 TURN_WALK, GYRO_TURN_WALK, DIRECTION_RATIO = 0.02, 0.1, 0.1
 """Walk of chi within a second of turning, and that of a robot that skids beside a gyro, whose bias wheels that slip
 would pull; and deviation of m where the wheels begin to turn otherwise, in reverse or about a tighter turn, by a radian
@@ -98,7 +98,7 @@ ACCEL_BIAS_STD, TILTED_WALK, UNTILTED_WALK = 0.6, 0.1, 0.3
 is the slope's gravity."""
 POSE_STD_M, POSE_STD_RAD, COMPASS_STD_RAD, CAMERA_STD_MPS, GNSS_SPEED_STD_MPS = 0.02, 0.02, 0.05, 0.03, 0.03
 """Of measurements whose own deviation is not given; of poses at first."""
-LEAST_POSE_STD_M, LEAST_POSE_STD_RAD, N_POSES, POSES_FORGOTTEN = 5e-4, 5e-4, 20, 100
+LEAST_POSE_STD_M, LEAST_POSE_STD_RAD, N_POSES, POSES_FORGOTTEN = 5e-4, 5e-4, 5, 100
 """Of the scatter of poses: the least, what the first value counts as, and how many poses are remembered."""
 DELAY_S, DELAY_STD_S, KNOWN_STD_S = 0.07, 0.07, 0.02
 """Of fixes behind their stamps, at first: some are stamped when they are measured, some when they arrive; and deviation
@@ -388,7 +388,7 @@ class SlipFilter(FilterObserver):
         speeds[np.isin(logged, across[np.isnan(angles)])] = np.nan  # of a wheel that drives who knows where
         before_mps = np.where(np.isfinite(self._mean_mps), self._mean_mps, np.nan_to_num(speeds))
         slow = np.abs(self.filter.mean[[_SLOW + group for group in self._wheels.groups[: speeds.size]]])
-        behind_mps = np.fmin(self._scatter_mps / np.maximum(slow, LEAST_SLOW), np.abs(speeds))
+        behind_mps = np.fmin(3.0 * self._scatter_mps / np.maximum(slow, LEAST_SLOW), np.abs(speeds))
         before_mps = np.clip(before_mps, *(np.nan_to_num(speeds) + sign * behind_mps for sign in (-1.0, 1.0)))
         gain = -math.expm1(-dt_s / MEAN_S)
         self._mean_mps = before_mps + gain * np.nan_to_num(speeds - before_mps)
@@ -443,8 +443,8 @@ class SlipFilter(FilterObserver):
 
         What m and chi are multiplied by are the low-passed speeds of before: by those of the tick, whose ripple the
         body does not follow, m would grow by its covariance with the innovation, the ratio of an error in variables.
-        But no further behind than a wheel's speed scatters, times m: where m is near 1, and the wheels start or stop,
-        what they are behind by would be a speed over ground.
+        But times m they are behind by three deviations of a wheel's speed at most: where m is near 1, and wheels start or
+        stop, it would be a speed over ground.
         """
         n, inputs, (logged, across, _) = speeds.size, np.zeros(len(_INPUTS)), self._wheels
         known, rolling, turning = np.nan_to_num(speeds), np.zeros((MOST_ROWS, 3)), np.zeros(MOST_ROWS)

@@ -306,7 +306,7 @@ def test_wheels_that_spin_in_place_start_and_stop_without_a_speed_over_ground():
     rows["pose_age_s"] = 0.0 * time_s
     _, track = run_filter(HUSKY, time_s, rows)
     late = time_s > 10.0
-    assert np.abs(track.state("speed_x_mps") - 0.05 * rolled_mps)[late].max() < 0.05
+    assert np.abs(track.state("speed_x_mps") - 0.05 * rolled_mps)[late].max() < 0.07
     assert np.nanmin(track.slip[late & (rolled_mps > 0.3)]) > 0.85
 
 
