@@ -443,8 +443,8 @@ class SlipFilter(FilterObserver):
 
         What m and chi are multiplied by are the low-passed speeds of before: by those of the tick, whose ripple the
         body does not follow, m would grow by its covariance with the innovation, the ratio of an error in variables.
-        But times m they are behind by three deviations of a wheel's speed at most: where m is near 1, and wheels start or
-        stop, it would be a speed over ground.
+        But times m they are behind by three deviations of a wheel's speed at most: where m is near 1 and wheels start
+        or stop, it would be a speed over ground.
         """
         n, inputs, (logged, across, _) = speeds.size, np.zeros(len(_INPUTS)), self._wheels
         known, rolling, turning = np.nan_to_num(speeds), np.zeros((MOST_ROWS, 3)), np.zeros(MOST_ROWS)
