@@ -64,8 +64,7 @@ def calibrate(settings: Settings, progress: Progress) -> CalibrationResult:
         check_file(out, "--out", (".yaml", ".yml"))
         if out.exists():
             raise ConfigError(f"{out}: is there already, and is left as it is; choose another --out")
-    of_logs = settings.robot if robot.skids else None
-    runs, _, doubts = load(settings.model_copy(update={"robot": of_logs}))
+    runs, _, doubts = load(settings)
     grounds = hard_grounds() if settings.hard is None else settings.hard
     findings = findings_of(runs, description, robot, grounds)
     if not any(finding.determined for finding in findings):

@@ -67,14 +67,14 @@ def findings_of(runs: Sequence[RunLog], description: Any, robot: Robot, hard: Se
     """Return what the runs of a robot show, by whatever measured its motion, beside what its description has.
 
     What a stream would show that no run has is there without a value.  ``DataError`` if a run is another robot's;
-    ``ConfigError`` if the description of a swerve or omni robot lacks a section.
+    ``ConfigError`` if the description of a swerve robot lacks a section.
     """
     for run in runs:
         if run.robot != robot.name:
             raise DataError(
                 f"run {run.run_id} is one of robot {run.robot!r}, and {robot.name!r} is calibrated"
             )
-    if isinstance(robot, SwerveRobot | OmniRobot):
+    if isinstance(robot, SwerveRobot):
         robot.require(*robot.sections)
     resting = [stretch for run in runs for stretch in standing(run, robot)]
     held = [stretch for run in runs for stretch in standing(run, robot, MIN_POSITION_S)]

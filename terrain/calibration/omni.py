@@ -58,7 +58,11 @@ def identify_omni(runs: Sequence[RunLog], robot: OmniRobot, seed: int = 0) -> li
     own = [
         run for run in runs if outside_source(run) is not None and not run.session and len(run.terrains) == 1
     ]
-    friction = motor_friction(alone, robot)
+    friction = undetermined(
+        [FRICTION], "the description has no section 'motors', by which currents are torques"
+    )[0]
+    if robot.describes("motors"):
+        friction = motor_friction(alone, robot)
     measured = measure(own, robot, window_s=WINDOW_S, stride_s=STRIDE_S, seed=seed)
     surfaces = {
         name: on_it
