@@ -51,6 +51,9 @@ NO_PEAK = (
 FEW_RUNS = f"fewer than {MIN_RUNS} runs with a slip in steady motion"
 BRAKES = "the median slip is negative: the robot is faster than its wheels, downhill or by a wrong radius"
 
+SPINS_RATIO = 0.8  #: Slip beyond which a robot hardly moves: a fifth of what its wheels roll
+SPINS = "the robot hardly moves: its wheels spin, and where thrust balances resistance is not shown"
+
 
 def simulated_table(
     robot: Robot, terrains: Sequence[str], seed: int, progress: Callable[[int, int], None]
@@ -259,6 +262,8 @@ def learn_surfaces(
         targets[terrain] = assumed = _assumed(terrain)
         # an interval with 0 in it is that of a wheel that hardly slips, whose radius is known to a percent
         reasons[terrain] = BRAKES if slip.slip_ratio < 0.0 and not slip.interval[1] >= 0.0 else NO_PEAK
+        if slip.slip_ratio > SPINS_RATIO:
+            reasons[terrain] = SPINS
         if slip.n_runs < MIN_RUNS:
             reasons[terrain] = FEW_RUNS
         if reasons[terrain] is not NO_PEAK:

@@ -10,7 +10,7 @@ from pipelines.data.datasets import load_runs
 from pipelines.slip.estimate import estimate_runs
 from pipelines.slip.learn_slip import learn_slip_table
 from pipelines.slip.measured import SHORT_STRIDE_S
-from terrain.control.learned_table import FEW_RUNS, NO_PEAK
+from terrain.control.learned_table import BRAKES, FEW_RUNS, NO_PEAK, SPINS
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.kinematics.logged_wheels import with_wheel_speeds
@@ -212,6 +212,24 @@ def test_steady_slip_and_thrust_are_learned_and_what_was_not_driven_stays_assume
     found = learned.surfaces["moss"]
     assert found["current_a"][0] == pytest.approx(0.6)
     assert found["thrust_ratio"][0] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("slips", "reason", "steady"),
+    [
+        ((0.93, 0.95, 0.96), SPINS, None),
+        ((-0.004, -0.001, 0.003), NO_PEAK, 0.0),
+        ((-0.09, -0.1, -0.11), BRAKES, None),
+    ],
+)
+def test_a_slip_that_is_no_operating_point_is_not_learned_and_one_about_0_is_0(slips, reason, steady):
+    rng = np.random.default_rng(1)
+    runs = [omni_run(rng, f"ice_{i}", "ice", 0.3 * i, slip, 0.6) for i, slip in enumerate(slips)]
+    found = learn_slip_table(runs, ROBOTINO).surfaces["ice"]
+    assert found["reason"] == reason
+    if steady is not None:
+        assert found["targets"]["steady"]["slip_ratio"] == steady
+    assert (found["targets"]["steady"]["status"] == "estimated") == (steady is not None)
 
 
 def test_what_a_session_costs_another_is_the_difference_that_was_hidden(runs, learned):
