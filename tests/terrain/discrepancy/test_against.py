@@ -14,6 +14,7 @@ from terrain.effects import effect_named, vector_of
 from terrain.errors import DataError
 from terrain.robots import load_robot
 
+pytestmark = pytest.mark.usefixtures("without_next_drive")
 HUSKY = load_robot("husky")
 LIBRARY = tuple(map(effect_named, ("wheel_radius", "effective_track", "payload", "gyro_scale", "camera_yaw")))
 

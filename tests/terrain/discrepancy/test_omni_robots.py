@@ -16,6 +16,7 @@ from terrain.robots import load_robot
 from terrain.simulation.plants.planar import Ground, spread_numbers
 from terrain.simulation.run import simulate
 
+pytestmark = pytest.mark.usefixtures("without_next_drive")
 ROBOT = load_robot("robotino")
 CARPET = Ground(slip_ratio=0.8, rolling_ratio=0.03, roller_ratio=0.3)
 FREE = CARPET._replace(roller_ratio=0.0, rolling_ratio=0.0)
