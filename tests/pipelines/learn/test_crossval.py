@@ -221,6 +221,7 @@ def test_a_terrain_left_out_has_areas_their_intervals_and_both_rates(drive_all, 
     )  # of five or six runs a new one is the most unlike in a sixth of cases
 
 
+@pytest.mark.slow
 def test_terrains_of_vulpi_are_classified_on_held_out_runs(datasets_dir, settings):
     found = crossval(load_runs(datasets_dir / "vulpi"), settings())
     assert found.accuracy > 0.90

@@ -300,7 +300,7 @@ def test_without_turns_or_gyro_it_is_unknown_and_not_zero():
     assert found["lidar_delay_s"].low < 0.25 < found["lidar_delay_s"].high  # behind the wheels: 0.3 - 0.05
 
 
-@pytest.mark.parametrize("name", ["warthog", "marmotte"])
+@pytest.mark.parametrize("name", [pytest.param("warthog", marks=pytest.mark.slow), "marmotte"])
 def test_what_the_package_states_is_what_measured_logs_show(measured_runs, name):
     folder = {"warthog": "drive_warthog_terrains", "marmotte": "drive_marmotte"}[name]
     robot = load_robot(name)

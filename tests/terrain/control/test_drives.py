@@ -15,7 +15,7 @@ from terrain.records import Reading
 from terrain.robots import SkidSteerRobot, load_robot
 from terrain.slip import slip_ratio
 
-DT_S, SUBSTEPS, G = 0.02, 8, 9.81
+DT_S, SUBSTEPS, G = 0.02, 4, 9.81
 STATES = ("position_x_m", "position_y_m", "yaw_rad")
 
 

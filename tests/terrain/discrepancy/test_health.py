@@ -879,7 +879,7 @@ def test_a_channel_that_holds_its_largest_value_is_not_at_the_end_of_a_range_whe
 # -- Measured logs: no fault, wheels and lidar of one robot that are late, runs of another that are stuck -----
 
 
-@pytest.mark.parametrize("folder", ["drive_husky", "borealtc", "vulpi"])
+@pytest.mark.parametrize("folder", [pytest.param("drive_husky", marks=pytest.mark.slow), "borealtc", "vulpi"])
 def test_measured_huskies_have_no_fault_and_what_is_late_or_stuck_is_found(measured_runs, folder):
     runs = measured_runs(folder)
     lags = latencies(runs)

@@ -58,7 +58,6 @@ def collinearity(info, names):
     ("simulation", "group", "names"),
     [
         (HUSKY, ("rolling_resistance", "viscous_drag"), ["rolling_resistance_ratio", "viscous_drag_nspm"]),
-        (HUSKY, ("force_slip", "shear_slip"), ["force_slip_ratio", "shear_slip_ratio"]),
         (AGRIMARO, ("steering_offset_1", "gyro_bias"), ["steering_offset_1_rad", "gyro_bias_radps"]),
     ],
 )

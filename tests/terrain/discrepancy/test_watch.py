@@ -252,6 +252,7 @@ DRIVE_HUSKY = {
 }
 
 
+@pytest.mark.slow
 def test_measured_runs_agree_with_what_others_of_them_show_and_a_changed_gyro_departs(measured_runs):
     runs = in_order(measured_runs("drive_husky"))
     robot = replace(HUSKY, effects=DRIVE_HUSKY, effects_cov=np.full((4, 4), np.nan))

@@ -663,8 +663,8 @@ SESSIONS = ("asphalt_1", "asphalt_2", "asphalt_3", "gravel_1", "sand_1", "sand_2
 RECORDINGS = ("husky_wet_grass", "warthog_asphalt", "warthog_grass")
 GIVEN = [
     ("drive_husky", "", 3),
-    *(("drive_warthog_terrains", session, 6) for session in SESSIONS),
-    *(("drive_recordings", session, 6) for session in RECORDINGS),
+    *(pytest.param("drive_warthog_terrains", each, 6, marks=pytest.mark.slow) for each in SESSIONS),
+    *(pytest.param("drive_recordings", each, 6, marks=pytest.mark.slow) for each in RECORDINGS),
 ]
 """Folder, session, and by how many samples the lidar comes later."""
 

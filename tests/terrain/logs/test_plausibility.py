@@ -146,17 +146,11 @@ def test_simulated_runs_are_plausible(robot, terrain, scenario):
     assert not odd
 
 
-SETS = (
-    "borealtc",
-    "vulpi",
-    "drive_husky",
-    "drive_warthog_terrains/sand_1",
-    "drive_marmotte",
-    "drive_recordings",
-)
+SETS = ("borealtc", "vulpi", "drive_warthog_terrains/sand_1")
+LARGE = ("drive_husky", "drive_marmotte", "drive_recordings")
 
 
-@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("name", [*SETS, *(pytest.param(name, marks=pytest.mark.slow) for name in LARGE)])
 def test_no_measured_run_is_implausible(measured_runs, name):
     robot = {"drive_warthog_terrains/sand_1": "warthog", "drive_marmotte": "marmotte"}.get(name)
     runs = measured_runs(name, robot=robot)
