@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 from yamauchi_slip import (
-    ILL_CONDITIONED,
     fit_runs,
-    fit_track_ratio,
     fit_turning,
-    fit_turning_angle,
     identify_slip_model,
     local_polynomial,
     slip_samples,
@@ -88,21 +85,6 @@ def test_what_was_not_driven_is_named_and_stays_wide():
         identify_slip_model([], ROBOT)
 
 
-def test_the_regression_reports_collinear_yaw_rates():
-    runs = []
-    for k, slope in enumerate((0.0, 0.17)):
-        for up in (1.6, -1.6):
-            runs += turns(load_soil("dry_sand"), 30 + k, (12, 20, 30), Slope(slope, up))
-    samples = slip_samples(runs, ROBOT).turning
-    found = fit_turning_angle(samples, D)
-    assert found.condition > ILL_CONDITIONED
-    assert min(found.inflation[2:4]) > 50
-    assert found.coefficient[1] == 0.0  # the input speed is the same in all runs
-    assert found.coefficient[4] < 0 < 0.5 < found.r2_ratio
-    ratio = fit_track_ratio(samples, D)
-    assert 1.4 < ratio.coefficient[0] < 1.8
-
-
 def test_the_fit_is_least_squares_with_the_sandwich_of_runs():
     rng, run = np.random.default_rng(0), np.repeat(np.arange(15), 20)
     x = np.column_stack([np.ones(300), np.repeat(rng.normal(size=15), 20)])
@@ -113,25 +95,6 @@ def test_the_fit_is_least_squares_with_the_sandwich_of_runs():
     assert found.residual_std == pytest.approx(0.1, rel=0.15)
     other = identify(lambda p: x @ p - y, [Parameter("intercept", 0.0), Parameter("slope", 0.0)], run)
     assert found.interval == pytest.approx(other.interval, rel=1e-6)
-
-
-def test_a_ridge_is_chosen_by_runs_left_out_only_where_columns_are_collinear():
-    rng = np.random.default_rng(1)
-    run = np.repeat(np.arange(10), 30)
-    a = rng.normal(size=300)
-    x = np.column_stack([np.ones(300), a, a + 0.002 * rng.normal(size=300)])
-    y = x[:, 1] + np.repeat(rng.normal(size=10), 30)
-    found = fit_runs(x, y, run, ("one", "a", "b"), ridge=True)
-    assert found.ridge_ratio > 0
-    assert found.coefficient[1] + found.coefficient[2] == pytest.approx(1.0, abs=0.4)
-    plain = fit_runs(x, y, run, ("one", "a", "b"))
-    assert np.abs(found.coefficient[1:]).max() < 0.9 * np.abs(plain.coefficient[1:]).max()
-    assert found.std[1] < plain.std[1]
-    assert fit_runs(x[:, :2], y, run, ("one", "a"), ridge=True).ridge_ratio == 0.0
-    with pytest.raises(DataError, match="not independent"):
-        fit_runs(np.column_stack([a, 2 * a]), y, run, ("a", "b"))
-    with pytest.raises(DataError, match="three or more runs"):
-        fit_runs(x, y, run // 5, ("one", "a", "b"))
 
 
 def test_parabolas_are_numpys():
