@@ -246,8 +246,16 @@ def _own_sizes(robot: Robot, size_m: float) -> Iterator[Size]:
 def _body_sizes(robot: Robot, size_m: float) -> Iterator[Size]:
     body, radius_m, mass_kg = robot.body, robot.wheel_radius_m, robot.mass_kg
     of_wheel = f"a wheel of radius {radius_m:.3g} m"
-    yield Size("body.com_x_m", body.com_x_m, -size_m, size_m, f"a robot of {size_m:.3g} m")
-    yield Size("body.com_y_m", body.com_y_m, -size_m, size_m, f"a robot of {size_m:.3g} m")
+    low_m, high_m, half_m, where = -size_m, size_m, size_m, f"a robot of {size_m:.3g} m"
+    if (
+        robot.n_tyres == 4 or robot.skids
+    ):  # beyond the wheels it would tip over; of three see Robot.check_load
+        x_m, where = robot.wheel_positions_m[:, 0], "between the wheels, beyond which it tips over"
+        low_m, high_m, half_m = float(x_m.min()), float(x_m.max()), robot.track_m / 2
+        if robot.skids:
+            low_m, high_m = -robot.wheelbase_m / 2, robot.wheelbase_m / 2
+    yield Size("body.com_x_m", body.com_x_m, low_m, high_m, where)
+    yield Size("body.com_y_m", body.com_y_m, -half_m, half_m, where)
     yield Size("body.com_height_m", body.com_height_m, 0.0, 2.0 * size_m, f"a robot of {size_m:.3g} m")
     yield Size("body.tyre_width_m", body.tyre_width_m, 0.02 * radius_m, 5.0 * radius_m, of_wheel)
     # of a tyre a chord, of a track a part of its length

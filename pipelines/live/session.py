@@ -47,7 +47,9 @@ SEEN = ("slip_ratio", "slip_std", "wheel_speed_mps", "current_a", *MOTION)
 """What an observation has of the estimate of a motion."""
 
 NOT_ESTIMATED = "no filter runs: the model of the terrain takes none, and no robot is described or driven"
-NOT_FOLLOWED = "the wheels do not do what is commanded, and are left out (follows: false if another controller drives)"
+NOT_FOLLOWED = (
+    "the wheels do not do what is commanded, and are left out (follows: false if another controller drives)"
+)
 
 WINDOW = (
     *("start_s", "end_s", "terrain", "probabilities", "refused", "nearest", "novelty", "supported"),

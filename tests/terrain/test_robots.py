@@ -89,6 +89,7 @@ def test_a_section_that_is_not_described_is_named_and_a_completed_robot_has_a_ne
         (ROBOTINO, {"track_m": -0.1}, "wheel_distance_m must be above zero"),
         (ROBOTINO, {"body": {"com_x_m": 0.2}}, "outside the triangle of the wheels: wheel 2 would carry"),
         (AGRIMARO, {"body": {"com_x_m": 0.6}}, "outside the triangle of the wheels: wheel 1 would carry"),
+        (HUSKY, {"body": {"com_y_m": 0.3}}, "com_y_m is 0.3, -0.285 to 0.285 m is expected"),
         (AGRIMARO, {"track_m": 1.5}, "track_m is 1.5; the footprint allows"),
         (UGV, {"track_width_m": 2.0}, "the tracks would overlap"),
         (CAR, {"com_ahead_m": 2.0}, "between 0 and wheelbase_m"),

@@ -301,11 +301,15 @@ def make_plant(robot: Robot, conditions: Conditions) -> Array:
     inverse = np.linalg.inv(balance) if len(places) == 3 else np.linalg.pinv(balance)
     load_fraction = inverse @ np.array([1.0, com_m[0], com_m[1]])
     if load_fraction.min() <= 0.0:
-        x_m, y_m = conditions.payload_m
+        (x_m, y_m), what = com_m - offset_m, "its centre of mass"
+        if conditions.payload_kg:
+            (x_m, y_m), what = (
+                conditions.payload_m,
+                f"a payload of {conditions.payload_kg:g} kg, beside its centre of mass",
+            )
         raise ConfigError(
-            f"robot {robot.name}: a payload of {conditions.payload_kg:g} kg at ({x_m:g}, {y_m:g}) m "
-            f"from the centre of mass tips it over: wheel {places[int(load_fraction.argmin())].wheel + 1} would carry "
-            "nothing"
+            f"robot {robot.name}: {what} at ({x_m:g}, {y_m:g}) m tips it over: wheel "
+            f"{places[int(load_fraction.argmin())].wheel + 1} would carry nothing"
         )
     wheels: dict[str, Any] = {
         "wheels_m": robot.wheel_positions_m,
