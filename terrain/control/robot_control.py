@@ -249,7 +249,7 @@ N_COMMANDS = 32  #: Of the last steps, which are compared.
 #: be over; low-pass of what is measured, against the ripple of the Hall steps.
 WINDOW_S, PERSISTS_S, SETTLED_S, SMOOTH_S = 0.4, 0.06, 0.1, 0.04
 #: Time within which a motor changes its rate where the command has; a loaded one takes 0.12 s to start.
-STILL_S = 0.18
+STILL_S = 0.16
 #: A second low-pass, and how far the first is ahead of it, in m/s or rad, where a command is approached.
 SLOW_S, APPROACH = 0.2, 0.02
 #: Tolerances: of a wheel's speed, a constant and a part of the command, and of a steering angle.
@@ -379,7 +379,7 @@ class RobotControl:
         if states:
             check_channels("wheels", robot.rate_channels, wheels)
         self._n_columns = len(wheels), len(imu)
-        self._streams = StreamHealth(robot, channels) if states and not self._angles else None
+        self._streams = StreamHealth(robot, channels, states) if states and not self._angles else None
         #: names of the sensors that are judged
         self.sensors = SENSORS if self._streams is None else self._streams.names
         self._rates = [wheels.index(channel) for channel in robot.rate_channels if states]

@@ -38,18 +38,14 @@ from terrain.robots import Robot
 LATE_PERIODS = 2.5  #: Of a sensor that is slower, so many of its periods make it lost.
 REPEATED_S, N_REPEATED = 0.15, 2  #: Least time and number of repetitions of a sensor that is frozen.
 BELIEVED_S = 5.0  #: A value that has jumped and stays is believed after this long.
-N_JUMPED = (
-    2  #: So many samples have to stay where they jumped to: one alone is an outlier, which the filter gates.
-)
-#: Least jump beyond what accelerometer and wheels show, and what it is of a speed's scatter, or a position's deviation.
-SPEED_JUMP_MPS, POSITION_JUMP_M, JUMP_STD = 0.15, 0.5, 4.5
-SCATTER_MPS, N_SCATTER = (
-    0.05,
-    50,
-)  #: Of the changes of a speed at first, and over how many samples it is learned.
-N_GAINED = (
-    32  #: Steps for which the accelerometer's integral is remembered: samples come late by a quarter second.
-)
+#: So many samples have to stay where they jumped to: one alone is an outlier, which the filter gates.
+N_JUMPED = 2
+SPEED_JUMP_MPS, POSITION_JUMP_M = 0.15, 0.5  #: Least jump beyond what accelerometer and wheels show.
+#: A jump over the median change of a speed, and over the deviation of a position; the median at first, and how many
+#: samples move it.  An IMU that is shaken shows the change of a speed to as much.
+JUMPS, JUMP_STD, SCATTER_MPS, N_SCATTER = 7.0, 4.5, 0.06, 25.0
+#: Steps for which the accelerometer's integral is remembered: samples come late by a quarter of a second.
+N_GAINED = 32
 SIGNED_MPS = 0.1  #: A robot that is slower may drive in either direction.
 #: Sensors of each stream but the wheels, each with its channels; of a position and a velocity all have to repeat.
 SENSORS_OF: Mapping[str, Mapping[str, tuple[str, ...]]] = {
@@ -83,14 +79,14 @@ class _Seen:
 
     __slots__ = (
         *("apart", "came_s", "changed_s", "integral", "jumped", "jumped_s", "longest_s"),
-        *("n_after", "n_same", "period_s", "scatter", "stamp_s", "value"),
+        *("n_after", "n_same", "period_s", "scatter", "stamp_s", "usual", "value"),
     )
 
     def __init__(self) -> None:
         self.value = np.empty(0)
         self.stamp_s = self.came_s = self.changed_s = self.jumped_s = math.nan
         self.period_s = self.longest_s = self.apart = self.integral = 0.0
-        self.scatter = SCATTER_MPS**2
+        self.scatter = self.usual = SCATTER_MPS
         self.jumped = np.zeros(1)
         self.n_same = self.n_after = 0
 
@@ -98,7 +94,8 @@ class _Seen:
 class StreamHealth:
     """Judges the sensors of a robot, step by step.
 
-    ``channels`` of each stream are in the order of the columns of its readings.
+    ``channels`` of each stream are in the order of the columns of its readings, ``states`` those of the filter: its
+    delays count.
 
     Attributes
     ----------
@@ -116,7 +113,9 @@ class StreamHealth:
     [7, 7]
     """
 
-    def __init__(self, robot: Robot, channels: Mapping[str, Sequence[str]]) -> None:
+    def __init__(
+        self, robot: Robot, channels: Mapping[str, Sequence[str]], states: Sequence[str] = ()
+    ) -> None:
         places = {stream: list(names) for stream, names in channels.items()}
         self._widths = {stream: len(names) for stream, names in places.items()}
         self._sensors = [
@@ -134,6 +133,9 @@ class StreamHealth:
         self.health = [int(Health.FRESH)] * len(self.names)
         self._seen = [_Seen() for _ in self.names]
         self._travelled_m, self._ahead, self._sideways = 0.0, 1.0, robot.sideways
+        delays = {"gnss": "gnss_delay_s", **dict.fromkeys(("odometry", "lidar"), "pose_delay_s")}
+        self._delays = {stream: states.index(name) for stream, name in delays.items() if name in states}
+        self._delay_s = dict.fromkeys(self._delays, 0.0)
         self._gained: deque[tuple[float, float]] = deque(maxlen=N_GAINED)
 
     def step(
@@ -151,6 +153,8 @@ class StreamHealth:
             else:
                 gained_mps = self._gained[-1][1] if self._gained else 0.0
                 self._gained.append((now_s, gained_mps + motion.accel_x_mps2 * dt_s))
+            for stream, place in self._delays.items():
+                self._delay_s[stream] = float(motion.mean[place])
             if abs(motion.speed_x_mps) > SIGNED_MPS:
                 self._ahead = math.copysign(1.0, motion.speed_x_mps)
         disagrees, period_s = False, math.inf
@@ -197,7 +201,8 @@ class StreamHealth:
         integral = self._travelled_m
         if is_speed:  # at the sample's own instant, which may be a while ago
             gained = np.array(self._gained).reshape(-1, 2)
-            integral = float(np.interp(stamp_s, gained[:, 0], gained[:, 1])) if len(gained) else math.nan
+            at_s = stamp_s - self._delay_s.get(sensor.stream, 0.0)
+            integral = float(np.interp(at_s, gained[:, 0], gained[:, 1])) if len(gained) else math.nan
         before, passed_s = seen.value, stamp_s - seen.stamp_s
         same = before.size > 0 and bool((row[:2] == before[:2]).all())
         if same and seen.n_same + 1 >= N_REPEATED:  # it measures nothing: what it changes by then is no jump
@@ -211,11 +216,12 @@ class StreamHealth:
             limit = sensor.jump + sensor.jump_per_s * passed_s
             if is_speed:
                 change = np.nan_to_num(change[-1:] - by)
-                limit = max(limit, JUMP_STD * math.sqrt(seen.scatter))
+                limit = max(limit, JUMPS * seen.scatter)
                 bounded = min(max(float(change[0]), -limit), limit)
                 seen.apart = seen.apart * math.exp(-passed_s / COMPARED_S) + bounded
-                if abs(bounded) < limit:
-                    seen.scatter += (bounded**2 - seen.scatter) / N_SCATTER
+                if moves:  # at rest nothing shakes
+                    seen.scatter = _median(seen.scatter, abs(bounded))
+                    seen.usual = _median(seen.usual, abs(seen.apart))
             elif sensor.stream in _REFERENCES:
                 change = change[:2]
                 limit += by + JUMP_STD * math.hypot(*np.nan_to_num([*before[2:], *row[2:]]))
@@ -256,7 +262,12 @@ class StreamHealth:
             return Health.FROZEN
         if seen.jumped.any() and seen.n_after >= N_JUMPED - 1:
             return Health.STEPPED
-        return Health.DISAGREES if abs(seen.apart) > DISAGREES_MPS else Health.FRESH
+        return Health.DISAGREES if abs(seen.apart) > max(DISAGREES_MPS, JUMPS * seen.usual) else Health.FRESH
+
+
+def _median(before: float, size: float) -> float:
+    """Return the median of sizes, moved towards one more: outliers move it no more than others."""
+    return before * math.exp(math.copysign(1.0 / N_SCATTER, size - before))
 
 
 def _jump(name: str, channel: str) -> tuple[float, float]:
