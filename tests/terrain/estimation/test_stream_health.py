@@ -13,12 +13,12 @@ from terrain.robots import load_robot
 
 ROBOT = load_robot("husky")
 CHANNELS = sensor_channels(ROBOT)
-DT_S, SPEED_MPS, FAULT_S = 0.02, 0.8, 2.0
+DT_S, SPEED_MPS, FAULT_S = 0.02, 0.8, 4.0
 EVERY = {"wheels": 1, "imu": 1, "odometry": 2, "gnss": 5}  # steps from sample to sample
 STD = {"speed_x_mps": 0.02, "velocity_x_mps": 0.03, "position_x_m": 0.02, "pitch_rad": 0.01}
 
 
-def judged(change=lambda name, time_s, row: row, length_s=4.0, age_s=lambda time_s: 0.0, seed=0):
+def judged(change=lambda name, time_s, row: row, length_s=6.0, age_s=lambda time_s: 0.0, seed=0):
     """The health of each sensor at each step of a steady drive, whose samples ``change`` makes others of, or none."""
     rng, judge, found = np.random.default_rng(seed), StreamHealth(ROBOT, CHANNELS), []
     for k in range(round(length_s / DT_S)):
