@@ -40,6 +40,8 @@ class Settings(JobsSettings):
     """Which runs are used, where the report goes, and under which name the model is registered."""
 
     data: Path | None = setting(None, "Folder of labelled runs; without, runs are simulated.")
+    robot: str | None = setting(None, "Robot of these runs, by name or its YAML file.")
+    mapping: Path | None = setting(None, "YAML file that describes how to read them (docs/mapping.md).")
     out: Path = setting(Path("terrain-report"), "Folder of the runs and the report.")
     name: str = setting("quickstart", "Name of the registered model.")
     seed: int = setting(0, "Deals runs into folds; of the simulation, too.", ge=0)
@@ -91,6 +93,7 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
     from terrain.logs.duplicates import distinct_runs
 
     data, out = settings.data, settings.out
+    reading: dict[str, Any] = {"robot": settings.robot, "mapping": settings.mapping}
     ensure_writable(out)
     ensure_tracking()
     with _compiling_ahead():
@@ -104,11 +107,11 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
             given, slip, example = labelled_runs(settings.seed, settings.runs_a_terrain, progress)
             figures = slip_figure(example), motion_figure(example)
         else:
-            given, _, doubts = load(RunsSettings(data=data))
+            given, _, doubts = load(RunsSettings(data=data, **reading))
         runs, _ = distinct_runs(given, merge=settings.merge_duplicates)
         dataset = SIMULATED if data is None else data.resolve().name
         training, held_out = hold_out_runs(runs)
-        kept = _keep(given, data, out / "runs", progress)
+        kept = _keep(given, data, out / "runs", reading, progress)
         asked = TrainingSettings(
             name=settings.name, seed=settings.seed, n_jobs=settings.n_jobs, repeats=REPEATS
         )
@@ -147,6 +150,8 @@ def _commands(settings: Settings, model_uri: str, held_out: Sequence[RunLog]) ->
     data, seed, steps = settings.data, settings.seed, []
     names = shlex.quote(",".join(run.run_id for run in held_out))
     without, only = (f" --without {names}", f" --only {names}") if held_out else ("", "")
+    asked = (("--robot", settings.robot), ("--mapping", settings.mapping))
+    reading = "".join(f" {option} {shlex.quote(str(each))}" for option, each in asked if each is not None)
     if data is None:
         from pipelines.slip.labelled import FILTER, ROBOT, SCENARIO
 
@@ -158,13 +163,15 @@ def _commands(settings: Settings, model_uri: str, held_out: Sequence[RunLog]) ->
         ]
     return (
         *steps,
-        f"terrain crossval --data {data} --protocol grouped --seed {seed}{without}",
-        f"terrain train --data {data} --name {settings.name} --seed {seed}{without}",
-        f"terrain predict --model {model_uri} --data {data}{only}",
+        f"terrain crossval --data {data}{reading} --protocol grouped --seed {seed}{without}",
+        f"terrain train --data {data}{reading} --name {settings.name} --seed {seed}{without}",
+        f"terrain predict --model {model_uri} --data {data}{reading}{only}",
     )
 
 
-def _keep(runs: Sequence[RunLog], data: Path | None, folder: Path, progress: Progress) -> dict[str, Any]:
+def _keep(
+    runs: Sequence[RunLog], data: Path | None, folder: Path, reading: Mapping[str, Any], progress: Progress
+) -> dict[str, Any]:
     """Write run folders into ``folder``; earlier ones of the same data are used as they are, others refused."""
     from pipelines.data.datasets import load
     from pipelines.data.settings import RunsSettings
@@ -173,7 +180,7 @@ def _keep(runs: Sequence[RunLog], data: Path | None, folder: Path, progress: Pro
 
     kept = {"out": folder, "n_runs": len(runs), "reused": folder.exists()}
     if kept["reused"]:
-        if data_digest(load(RunsSettings(data=folder))[0]) != data_digest(runs):
+        if data_digest(load(RunsSettings(data=folder, robot=reading["robot"]))[0]) != data_digest(runs):
             raise DataError(
                 f"{folder}: holds other runs than {data or 'this simulation'}; choose another --out"
             )
@@ -181,7 +188,7 @@ def _keep(runs: Sequence[RunLog], data: Path | None, folder: Path, progress: Pro
     elif data is not None:
         from pipelines.data import convert
 
-        return vars(convert.run(convert.Settings(data=data, out=folder), progress)) | kept
+        return vars(convert.run(convert.Settings(data=data, out=folder, **reading), progress)) | kept
     else:
         with atomic_folder(folder) as unfinished:
             for number, each in enumerate(runs, 1):
