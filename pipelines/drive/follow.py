@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,6 +30,7 @@ from terrain.records import Array, Command, RunLog, Sample
 from terrain.robots import Robot
 from terrain.simulation.assumed import with_assumed
 from terrain.simulation.scenario import RATE_HZ, Patch, Scenario
+from terrain.status import StatusCode
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,16 +44,14 @@ SHOWN_M = 1.5  #: Lateral errors beyond this leave the figure
 COLUMNS = ("time_s", "distance_m", "lateral_m", "position_x_m", "position_y_m", "speed_mps", "slip_ratio")
 
 
-class FollowResult(Result, eq=False):
-    """A path that a pilot followed, with the drive."""
+class PathDrive(Result, eq=False):
+    """A path that was followed."""
 
-    drive: Array
     offset_m: float
+    drive: Any  #: an array by columns, or a record of them
     reference: ReferencePath
     robot: str = described("name")
     path: Path = described("file of the path")
-    terrain: str = described("soil")
-    table: str = described("name of the table of target slips")
     seed: int = described("of the drive")
     length_m: float = described("length of the path", "m", form=".1f")
     speed_mps: float = described("desired", "m/s")
@@ -62,10 +61,54 @@ class FollowResult(Result, eq=False):
     lateral_rms_m: float = described("root mean square of the lateral error", "m", form=".3f")
     limit_m: float = described("a tenth of the speed, the bound of Deremetz et al.", "m")
     within_limit: bool = described("whether the largest error is below it and the end was reached")
-    slip_max_ratio: float = described("largest mean slip of the driven wheels above 0.2 m/s", "1", form=".3f")
-    statuses: Mapping[str, Mapping[str, int]] = described("steps by the status of path and pilot")
+    statuses: Mapping[str, Mapping[str, int]] = described("steps of 20 ms by the status of each part")
     page: Path | None = described("page that was written")
     files: tuple[Path, ...] = described("all that was written")
+
+    def write(self) -> None:
+        """Write the table of the drive, where there is a folder for it."""
+        if self.files:
+            table = self.to_pandas().to_csv(index=False, float_format="%.6g", na_rep="nan")
+            atomic_write(self.files[1], table)
+
+    @property
+    def verdict(self) -> str:
+        """Whether the path was followed, in a sentence."""
+        if not self.reached_end:
+            return "The end of the path was not reached."
+        beside = "within" if self.within_limit else "beyond"
+        worst, limit = (format_value(one, ".3f", "m") for one in (self.lateral_max_m, self.limit_m))
+        text = f"The path was followed to its end; the lateral error is at most {worst}, {beside} a tenth of the speed"
+        return f"{text}, {limit}."
+
+
+def path_figures(
+    settings: Settings, path: ReferencePath, speed_mps: float, error_m: Array, *, reached_end: bool
+) -> dict[str, Any]:
+    """Return the fields of :class:`PathDrive` that the settings, and the lateral errors (n,) of a drive, give."""
+    worst, limit_m, out = float(np.abs(error_m).max()), speed_mps / 10.0, settings.out
+    files = () if out is None else (out / PAGE_FILE, out / "drive.csv")
+    return {
+        "seed": settings.first_seed,
+        "offset_m": settings.offset,
+        "reference": path,
+        "speed_mps": speed_mps,
+        "reached_end": reached_end,
+        "lateral_max_m": worst,
+        "lateral_rms_m": float(np.sqrt(np.mean(error_m**2))),
+        "limit_m": limit_m,
+        "within_limit": bool(reached_end and worst <= limit_m),
+        "page": files[0] if files else None,
+        "files": files,
+    }
+
+
+class FollowResult(PathDrive, eq=False):
+    """A path that a pilot followed, with the drive."""
+
+    terrain: str = described("soil")
+    table: str = described("name of the table of target slips")
+    slip_max_ratio: float = described("largest mean slip of the driven wheels above 0.2 m/s", "1", form=".3f")
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the drive, a row a step."""
@@ -90,42 +133,30 @@ def follow(settings: Settings, robot: Robot, progress: Progress) -> FollowResult
     path, table = read_path(settings.path, settings.point_std), load_slip_table(settings.table, robot.name)
     drive, follower, log = drive_along(robot, path, table, settings, speed_mps)
     progress("drive", 1, 1)
-    error, out = np.abs(drive[:, 2] - settings.offset), settings.out
-    files = () if out is None else (out / PAGE_FILE, out / "drive.csv")
     moves, statuses = drive[:, 5] > 0.2, log.streams["control"].channel("status_code")
-    reached = follower.finished
-    worst, most_m = float(error.max()), speed_mps / 10.0
     result = FollowResult.of(
         settings,
         path,
         robot=robot.name,
         table=table.name,
-        seed=settings.first_seed,
-        speed_mps=speed_mps,
-        reached_end=reached,
         duration_s=float(drive[-1, 0]),
-        lateral_max_m=worst,
-        lateral_rms_m=float(np.sqrt(np.mean(error**2))),
-        limit_m=most_m,
-        within_limit=bool(reached and worst <= most_m),
+        **path_figures(
+            settings, path, speed_mps, drive[:, 2] - settings.offset, reached_end=follower.finished
+        ),
         slip_max_ratio=float(np.nanmax(drive[moves, 6])) if np.isfinite(drive[moves, 6]).any() else math.nan,
         statuses={
-            "path": _counted(PathStatus, [place.status for place in follower.places]),
-            "pilot": _counted(TractionStatus, statuses.tolist()),
+            "path": counted(place.status for place in follower.places),
+            "pilot": counted(TractionStatus(int(code)) for code in statuses.tolist()),
         },
-        page=files[0] if files else None,
-        files=files,
         drive=drive,
-        offset_m=settings.offset,
-        reference=path,
     )
-    if files:
-        atomic_write(files[1], result.to_pandas().to_csv(index=False, float_format="%.6g", na_rep="nan"))
+    result.write()
     return result
 
 
-def _counted(kind: Any, codes: Any) -> dict[str, int]:
-    return {kind(int(code)).label: n for code, n in sorted(Counter(codes).items())}
+def counted(codes: Iterable[StatusCode]) -> dict[str, int]:
+    """Return how often each status was, by its name."""
+    return {code.label: n for code, n in sorted(Counter(codes).items())}
 
 
 def at_origin(path: ReferencePath, offset_m: float) -> ReferencePath:
@@ -188,7 +219,7 @@ def report(result: FollowResult) -> Report:
     warnings = [] if result.reached_end else [f"the robot came to {result.drive[-1, 1]:.1f} m"]
     return Report(
         title=f"{result.robot} along {result.path.name}",
-        answer=verdict(result),
+        answer=result.verdict,
         lead=f"{result.speed_mps:.3g} m/s · {result.terrain} · table {result.table} · seed {result.seed}",
         picture=lateral_figure(result.drive[:, 1], result.drive[:, 2] - result.offset_m, result.limit_m),
         parts=[*(Text(text, "warning") for text in warnings), Pairs(figures)],
@@ -196,18 +227,6 @@ def report(result: FollowResult) -> Report:
             Section("Path and robot", list(_map(result))),
             Section("Steps of 20 ms by status", [Pairs(statuses)]),
         ],
-    )
-
-
-def verdict(result: FollowResult) -> str:
-    """Return whether the path was followed, in a sentence."""
-    if not result.reached_end:
-        return "The end of the path was not reached."
-    beside = "within" if result.within_limit else "beyond"
-    worst, limit = (format_value(one, ".3f", "m") for one in (result.lateral_max_m, result.limit_m))
-    return (
-        f"The path was followed to its end; the lateral error is at most {worst}, {beside} a tenth of the speed, "
-        f"{limit}."
     )
 
 
@@ -226,17 +245,19 @@ def lateral_figure(distance_m: Array, error_m: Array, limit_m: float) -> Figure:
     )
 
 
-def _map(result: FollowResult) -> Iterator[Figure]:
-    path, drive = at_origin(result.reference, result.offset_m), result.drive
+def map_figure(path: ReferencePath, position_m: Array, what: str) -> Figure:
+    """Show a path, and the positions (n, 2) of a part of the robot."""
     marks = (
         Line("path", path.x_m, path.y_m, 6, dashed=True),
-        Line("body's origin", drive[:, 3], drive[:, 4], 0),
+        Line(what, position_m[:, 0], position_m[:, 1], 0),
     )
-    yield Figure(
-        "The path, and where the robot was",
-        [Panel(marks, "y [m]", x_label="x [m]", equal=True)],
-        "From its start.",
-    )
+    panel = Panel(marks, "y [m]", x_label="x [m]", equal=True)
+    return Figure(f"The path, and where the {what} was", [panel])
+
+
+def _map(result: FollowResult) -> Iterator[Figure]:
+    drive = result.drive
+    yield map_figure(at_origin(result.reference, result.offset_m), drive[:, 3:5], "body's origin")
     panels = [
         Panel([Line("", drive[:, 1], drive[:, k], 0)], label)
         for k, label in ((5, "speed [m/s]"), (6, "slip ratio"))

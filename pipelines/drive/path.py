@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.drive.drive import PAGE_FILE
-from pipelines.drive.follow import DISTANCE, FollowResult, follow, lateral_figure
+from pipelines.drive.follow import (
+    DISTANCE,
+    FollowResult,
+    PathDrive,
+    counted,
+    follow,
+    lateral_figure,
+    map_figure,
+    path_figures,
+)
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
 from pipelines.report.numbers import format_counts, format_value
-from pipelines.report.results import Progress, Result, described
+from pipelines.report.results import Progress, described
 from pipelines.report.tree import Pairs, Part, Report, Section, Text
 from terrain.control.car_following import (
     CarFollower,
@@ -28,7 +34,6 @@ from terrain.control.car_following import (
 from terrain.control.paths import GRID_M, PathStatus, ReferencePath, read_path
 from terrain.errors import ConfigError
 from terrain.estimation.models.observer import ObserverStatus
-from terrain.files.atomic import atomic_write
 from terrain.robots import BicycleRobot, load_robot
 from terrain.simulation.plants.car import CarDrive, Ground
 from terrain.simulation.run import simulate
@@ -50,38 +55,19 @@ START_M, SLOW_MPS = 2.0, 0.5
 WHEELS = ("front", "rear")
 
 
-class PathResult(Result, eq=False):
-    """A path that was followed, with the drive."""
+class PathResult(PathDrive, eq=False):
+    """A path that a car-like robot followed, with the drive."""
 
-    offset_m: float
-    drive: FollowedDrive
-    reference: ReferencePath
-    robot: str = described("name")
-    path: Path = described("file of the path")
     observer: str = described("that gave the sideslip")
-    seed: int = described("of the noise")
-    length_m: float = described("length of the path", "m", form=".1f")
     n_points_merged: int = described("points of the file that lay too close to their neighbours")
-    speed_mps: float = described("desired", "m/s")
-    reached_end: bool = described("whether the robot came to the end")
-    duration_s: float = described("duration of the drive", "s", form=".1f")
     slowest_mps: float = described("slowest speed, start and standing excepted", "m/s")
-    lateral_max_m: float = described("largest lateral error, to the desired offset", "m", form=".3f")
-    lateral_rms_m: float = described("root mean square of the lateral error", "m", form=".3f")
     lateral_max_at_m: float = described("distance along the path of the largest error", "m")
-    limit_m: float = described("a tenth of the speed, the bound of Deremetz et al.", "m")
-    within_limit: bool = described("whether the largest error is below it and the end was reached")
     slip_max_rad: float = described("largest true slip angle above 0.5 m/s", "rad")
     slip_error_rad: float = described("root mean square error of the estimate; null without observer", "rad")
     stiffness_error_ratio: float = described("cornering stiffness, median error over the secant", "1")
     grip_ratio: float = described("largest side force over load as known at the end, with the preview", "1")
     grip_std: float = described("its standard deviation", "1")
-    statuses: Mapping[str, Mapping[str, int]] = described(
-        "ticks by the status of observer, path and steering"
-    )
     warnings: tuple[str, ...] = described("a sentence for each")
-    page: Path | None = described("page that was written")
-    files: tuple[Path, ...] = described("all that was written")
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the drive, a row a tick."""
@@ -116,26 +102,25 @@ def run(settings: Settings, progress: Progress) -> PathResult | FollowResult:
     path = read_path(settings.path, settings.point_std)
     drive, ticks = drive_along(robot, path, settings, speed_mps)
     progress("drive", 1, 1)
-    files = () if settings.out is None else (settings.out / PAGE_FILE, settings.out / "drive.csv")
+    codes: dict[str, Iterator[StatusCode]] = {
+        "observer": (ObserverStatus(tick.estimate.status) for tick in ticks),
+        "path": (tick.place.status for tick in ticks),
+        "steering": (tick.steer_status for tick in ticks),
+    }
     result = PathResult.of(
         settings,
         path,
         robot=robot.name,
-        seed=settings.first_seed,
         n_points_merged=path.n_merged,
-        speed_mps=speed_mps,
-        **path_figures(drive, settings, speed_mps),
-        statuses=tick_statuses(ticks),
+        **path_figures(
+            settings, path, speed_mps, drive.lateral_m - settings.offset, reached_end=drive.reached_end
+        ),
+        **slip_figures(drive, settings, speed_mps),
+        statuses={name: counted(found) for name, found in codes.items()},
         warnings=(*path_warnings(path, robot), *drive_warnings(drive, ticks, settings.stop)),
-        page=files[0] if files else None,
-        files=files,
-        offset_m=settings.offset,
         drive=drive,
-        reference=path,
     )
-    if files:
-        table = result.to_pandas().to_csv(index=False, float_format="%.6g", na_rep="nan")
-        atomic_write(files[1], table)
+    result.write()
     return result
 
 
@@ -158,7 +143,7 @@ def drive_along(
     return followed_drive(log, path, follower.ticks), follower.ticks
 
 
-def path_figures(drive: FollowedDrive, settings: Settings, speed_mps: float) -> dict[str, Any]:
+def slip_figures(drive: FollowedDrive, settings: Settings, speed_mps: float) -> dict[str, Any]:
     """Return figures of a drive by its truth; NaN where undefined, those of slip angles above :data:`SLOW_MPS`."""
     error = drive.lateral_m - settings.offset
     moves = drive.speed_mps > SLOW_MPS
@@ -167,33 +152,15 @@ def path_figures(drive: FollowedDrive, settings: Settings, speed_mps: float) -> 
     slips, errors = np.abs(drive.slip_true_rad[moves]), drive.slip_error_rad[moves]
     errors = errors[np.isfinite(errors)]
     observed = settings.observer != "none" and errors.size
-    worst, limit = float(np.abs(error).max()), speed_mps / 10.0
     return {
-        "reached_end": drive.reached_end,
         "duration_s": float(drive.time_s[-1]),
         "slowest_mps": float(drive.speed_mps[cruises].min()) if cruises.any() else math.nan,
-        "lateral_max_m": worst,
-        "lateral_rms_m": float(np.sqrt(np.mean(error**2))),
         "lateral_max_at_m": float(drive.distance_m[np.abs(error).argmax()]),
-        "limit_m": limit,
-        "within_limit": bool(drive.reached_end and worst <= limit),
         "slip_max_rad": float(np.nanmax(slips)) if np.isfinite(slips).any() else math.nan,
         "slip_error_rad": float(np.sqrt(np.mean(errors**2))) if observed else math.nan,
         "stiffness_error_ratio": float(np.median(stiffness)) if stiffness.size else math.nan,
         "grip_ratio": float(drive.grip_ratio[-1]),
         "grip_std": float(drive.grip_std[-1]),
-    }
-
-
-def tick_statuses(ticks: Sequence[FollowedTick]) -> dict[str, dict[str, int]]:
-    """Return the number of ticks by the status of observer, path and steering."""
-    codes: dict[str, list[StatusCode]] = {
-        "observer": [ObserverStatus(tick.estimate.status) for tick in ticks],
-        "path": [tick.place.status for tick in ticks],
-        "steering": [tick.steer_status for tick in ticks],
-    }
-    return {
-        name: {code.label: n for code, n in sorted(Counter(found).items())} for name, found in codes.items()
     }
 
 
@@ -235,7 +202,8 @@ def report(result: PathResult) -> Report:
     """Return whether the path was followed, its lateral error, and behind it what the observer gave."""
     degrees, drive = 180.0 / math.pi, result.drive
     figures: list[tuple[Any, ...]] = [
-        *result.pairs("length_m", "duration_s", "slowest_mps", "lateral_max_m", "lateral_rms_m"),
+        *result.pairs("length_m", "duration_s", "slowest_mps"),
+        *result.pairs("lateral_max_m", "lateral_max_at_m", "lateral_rms_m"),
         ("true slip angle, largest", result.slip_max_rad * degrees, "", "°"),
         ("slip angle, error of the estimate", result.slip_error_rad * degrees, "", "°"),
         *result.pairs("stiffness_error_ratio"),
@@ -246,7 +214,7 @@ def report(result: PathResult) -> Report:
     statuses = [(name, format_counts(counts)) for name, counts in result.statuses.items()]
     return Report(
         title=f"{result.robot} along {result.path.name}",
-        answer=verdict(result),
+        answer=result.verdict,
         lead=f"{result.speed_mps:g} m/s · sideslip by: {result.observer} · seed {result.seed}",
         picture=lateral_figure(drive.distance_m, drive.lateral_m - result.offset_m, result.limit_m),
         parts=[*(Text(text, "warning") for text in result.warnings), Pairs(figures)],
@@ -258,26 +226,9 @@ def report(result: PathResult) -> Report:
     )
 
 
-def verdict(result: PathResult) -> str:
-    """Return whether the path was followed, in a sentence."""
-    if not result.reached_end:
-        return "The end of the path was not reached."
-    beside = "within" if result.within_limit else "beyond"
-    return (
-        "The path was followed to its end; the lateral error is at most "
-        f"{format_value(result.lateral_max_m, '.3f', 'm')} (at {result.lateral_max_at_m:.0f} m), {beside} a tenth "
-        f"of the speed, {format_value(result.limit_m, '.3f', 'm')}."
-    )
-
-
 def _map(result: PathResult) -> Iterator[Part]:
-    path, drive = result.reference, result.drive
-    marks = [
-        Line("path", path.x_m, path.y_m, 6, dashed=True),
-        Line("rear axle", drive.position_m[:, 0], drive.position_m[:, 1], 0),
-    ]
-    seen = Panel(marks, "y [m]", x_label="x [m]", equal=True)
-    yield Figure("The path, and where the rear axle was", [seen])
+    drive = result.drive
+    yield map_figure(result.reference, drive.position_m, "rear axle")
     speed = Line("speed", drive.distance_m, drive.speed_mps)
     steering = Line("steering", drive.distance_m, np.degrees(drive.steer_rad))
     panels = Panel([speed], "speed [m/s]"), Panel([steering], "steering [°]")
