@@ -162,7 +162,7 @@ def test_the_ros_node_of_a_robot_publishes_the_twist_to_drive_and_its_wheels(ros
         node.callbacks["cmd_vel_desired"](desired)
     driven, wheels = node.publishers["cmd_vel"].messages[-1], node.publishers["wheel_commands"].messages[-1]
     assert driven.linear.x == pytest.approx(0.5)
-    assert driven.angular.z > 0.35
+    assert driven.angular.z > 0.31  # more than desired
     assert wheels.name == ["left", "right"]
     assert wheels.velocity[0] < wheels.velocity[1]
 
