@@ -102,6 +102,8 @@ class FilterModel:
     references: tuple[str, ...] = ()  #: sensors of the speed over ground
     #: sensors that are not reopened before two seconds: those that fail, rather than show the ground's doing
     held: tuple[str, ...] = ()
+    #: sensors whose rejection is put down to some states, each with one of them; of others by the rule of the settings
+    jumps: tuple[tuple[str, str], ...] = ()
     #: states that a gap in the data leaves where they were, with a covariance that grew
     positions: tuple[str, ...] = ()
     #: states that integrate another one, each with it: they share its noise
@@ -126,6 +128,7 @@ class FilterModel:
             *dict.fromkeys(("references", "held"), self.sensor_names).items(),
             *dict.fromkeys(("positions", "integrals", "angle_states"), self.states).items(),
             ("angle_rows", self.rows),
+            ("jumps", (*self.sensor_names, *self.states)),
         ):
             if unknown := set(np.ravel(getattr(self, what)).tolist()) - set(known):
                 raise ConfigError(f"{place}: {what} name {unknown}, none of {', '.join(known)}")
@@ -175,8 +178,8 @@ class FilterSettings(NamedTuple):
     gate_probability: float = 0.9999
     #: a sensor that was rejected all this time is believed once.  First the variance of the states that it is put
     #: down to goes back to the initial one, or to what explains the measurement where that is more.  These states are
-    #: those that it alone observes; without any, those that no sensor used before it in the row observes; else all
-    #: that it does.  A sensor that the model holds takes two seconds at least
+    #: those that the model has for it (jumps), or it alone observes; without any, those that no sensor used before it
+    #: in the row observes; else all that it does.  A sensor that the model holds takes two seconds at least
     reopen_after_s: float = 1.0
     #: over a longer step nothing is integrated; a log sampled slower than that needs another value
     max_gap_s: float = 1.0
@@ -195,6 +198,7 @@ MODEL = record(
             ("is_reference", "is_held", "is_angle_row", "is_angle_state", "is_position"), (bool, MOST)
         ),
         "rate": (int, MOST),  # of a state that integrates it; -1 of others
+        "jumps": (bool, (MOST, MOST)),  # whether the rejection of a sensor is put down to a state
         "x0": (float, MOST),
         **dict.fromkeys(("p0", "q"), (float, (MOST, MOST))),
         "thresholds": (float, MOST + 1),
@@ -373,10 +377,13 @@ def process_noise(model: FilterModel, dt_s: float, walk: Array | float = 0.0) ->
 def _choose_states(model: Any, state: Any, work: Any, k: int) -> None:
     """Mark the states that the rejection of sensor k is put down to.
 
-    Those that it alone observes; without any, those that no sensor used before it in this row observes;
-    without any, all that it observes.
+    Those that the model has for it; without any, those that it alone observes; without any, those that no sensor used
+    before it in this row observes; without any, all that it observes.
     """
     h, order, starts, chosen = work.h, model.order, model.starts, work.chosen
+    chosen[:] = model.jumps[k]
+    if chosen.any():
+        return
     for attempt in range(3):
         n_chosen = 0
         for j in range(model.n_states):
@@ -633,6 +640,8 @@ class Filter:
         ):
             one[name][: len(names)] = np.isin(names, chosen)
         one["rate"] = -1
+        for name, state in model.jumps:
+            one["jumps"][model.sensor_names.index(name), model.states.index(state)] = True
         for name, rate in model.integrals:
             one["rate"][model.states.index(name)] = model.states.index(rate)
         one["x0"][:d] = model.initial_mean

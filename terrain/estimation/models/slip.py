@@ -30,6 +30,9 @@ own instant, by its state, so that a receiver that is late leaves no error in th
 of four poses that follow each other evenly, over the root of 20, their gain on white noise; motion adds its jerk times
 the cube of the period.
 
+**Jumps.**  A pose or position that is rejected for :data:`terrain.estimation.filter.REOPEN_AFTER_S` is elsewhere: the
+position follows it, and speed and slip stay as they are, which what positions change by from there on measures.
+
 **Heading.**  Without pose or compass the heading follows from the motion.  Until it is known the filter runs in a frame
 that begins at 0; the angle between the travel by wheels and gyro and that of the receiver, and its deviation, then turn
 it to the receiver's frame: fixes are used from there on.  Driving backward is no exception.
@@ -110,6 +113,8 @@ LEAST_TRAVEL_M = 0.5
 DELAY_BOUNDS_S, SLIP_BOUNDS, LARGEST_BIAS_MPS2 = (-0.2, 0.8), (-3.0, 3.0), 3.0
 """Bounds of delay and of m, chi and d, far from what they are, which move the mean; and a bias beyond which an
 accelerometer is left out: its units or axes are others."""
+JUMP_M = 10.0
+"""How far a pose that is matched elsewhere, or a receiver by other satellites, may jump."""
 OLDEST_S = 1.0
 """Age of a fix beyond which there is none."""
 LOST_S, LOST_RATIO = 2.0, 0.9
@@ -346,7 +351,18 @@ class SlipFilter(FilterObserver):
             process_variance=np.zeros(len(self.states) + n_rows),
             measurement_variance=np.ones(MOST_ROWS + 1 + len(_REFERENCES)),
             initial_variance=np.square(
-                [1e-3, 1e-3, 1e-3, 1.0, 0.1, 0.5, BIAS_STD_RADPS, ACCEL_BIAS_STD, DELAY_STD_S, DELAY_STD_S]
+                [
+                    JUMP_M,
+                    JUMP_M,
+                    1e-3,
+                    1.0,
+                    0.1,
+                    0.5,
+                    BIAS_STD_RADPS,
+                    ACCEL_BIAS_STD,
+                    DELAY_STD_S,
+                    DELAY_STD_S,
+                ]
                 + [SLOW_RATIO] * n_slow
                 + [loss_std] * turns
                 + [FAST_RATIO] * n_rows
@@ -356,6 +372,11 @@ class SlipFilter(FilterObserver):
             ),
             inputs=_INPUTS,
             references=("pose", "gnss_position", "gnss_speed", "camera"),
+            # a reference that jumps is elsewhere, and shows no speed; a wheel that does slips for a moment
+            jumps=(
+                *((sensor, place) for sensor in ("pose", "gnss_position") for place in _MOTION[:2]),
+                *((f"wheel_{i}_mps", f"passing_slip_{i}_ratio") for i in range(n_rows)),
+            ),
             positions=_MOTION[:2],
             integrals=(("yaw_rad", "yaw_rate_radps"),),
             angle_states=("yaw_rad",),

@@ -311,6 +311,7 @@ def test_what_does_not_fit_is_refused():
         ({"states": ("position_m", "position_m")}, "have one twice"),
         ({"sensors": (("place", ("place_m",)),)}, "its sensors must hold every row once"),
         ({"references": ("camera",)}, "references name {'camera'}, none of place, rate"),
+        ({"jumps": (("camera", "position_m"),)}, "jumps name {'camera'}, none of place, rate"),
         ({"observe": drift}, "observe must be @njit, and take"),
         ({"propagate": print}, "propagate must be @njit, and take"),
     ):

@@ -351,6 +351,26 @@ def test_the_ripple_of_a_wheels_speed_is_no_slip_that_grows_without_a_reference(
         )
 
 
+@pytest.mark.parametrize("sensor", ["gnss", "pose"])
+def test_a_reference_that_jumps_is_elsewhere_and_shows_no_slip(sensor):
+    time_s, rows, true = drive(MINE, n=2000)
+    rows["gnss_x_m"] = rows["gnss_x_m"] + 1.5 * (time_s > 15.0) - 0.4 * (time_s > 19.0)
+    rows["gnss_y_m"] = rows["gnss_y_m"] - 0.8 * (time_s > 15.0) + 0.5 * (time_s > 27.0)
+    if sensor == "pose":
+        rows["pose_x_m"], rows["pose_y_m"] = rows.pop("gnss_x_m"), rows.pop("gnss_y_m")
+        rows["pose_yaw_rad"], rows["pose_age_s"] = (
+            np.where(np.isnan(rows["pose_x_m"]), np.nan, true["yaw"]),
+            0.0 * time_s,
+        )
+    rows = {name: row for name, row in rows.items() if not name.startswith("gnss_speed")}
+    filter_, track = run_filter(MINE, time_s, rows)
+    sensors = filter_.filter.dropped
+    assert any("gated" in kind for kind in sensors)
+    assert not any(kind.startswith("wheel") for kind in sensors)
+    assert np.abs(track.slip[time_s > 12.0] - 0.1).max() < 0.04
+    assert abs(track.state("position_x_m")[-1] - true["x"][-1] - 1.1) < 0.1
+
+
 def test_a_delay_that_a_description_has_is_there_from_the_first_pose_on():
     late = replace(MINE, identified={"pose_delay_s": 0.4})
     time_s, rows, truth = drive(late, n=200)
