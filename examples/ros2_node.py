@@ -10,11 +10,15 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import rclpy
-from geometry_msgs.msg import Twist, TwistStamped
-from rclpy.node import Node
-from sensor_msgs.msg import Imu, JointState
-from std_msgs.msg import Float64, String
+
+try:
+    import rclpy
+    from geometry_msgs.msg import Twist, TwistStamped
+    from rclpy.node import Node
+    from sensor_msgs.msg import Imu, JointState
+    from std_msgs.msg import Float64, String
+except ImportError as error:
+    sys.exit(f"error: {error}: source the setup file of a ROS 2 installation first")
 
 from pipelines.learn.model_file import read_model
 from pipelines.live.observer import Observer
@@ -26,7 +30,7 @@ IMU = (*(f"gyro_{axis}_radps" for axis in "xyz"), *(f"accel_{axis}_mps2" for axi
 WHEELS = ("speed_left_mps", "speed_right_mps", "current_left_a", "current_right_a")
 FIX = ("velocity_x_mps", "velocity_y_mps")  # east and north, of a receiver
 CHANNELS = {"imu": IMU, "wheels": WHEELS}
-JOINTS, WHEEL_RADIUS_M = ("left_wheel", "right_wheel"), 0.1651  # of the robot at hand
+JOINTS, WHEEL_RADIUS_M = ("left_wheel", "right_wheel"), 0.1651  # of the robot at hand, where none is named
 
 
 def terrain_node(model: Path, robot_name: str = "") -> Node:
@@ -83,7 +87,7 @@ def terrain_node(model: Path, robot_name: str = "") -> Node:
         rates, efforts = (
             part or [math.nan] * len(message.name) for part in (message.velocity, message.effort)
         )
-        speeds_mps = [rates[i] * WHEEL_RADIUS_M for i in at]
+        speeds_mps = [rates[i] * (WHEEL_RADIUS_M if robot is None else robot.wheel_radius_m) for i in at]
         take("wheels", message.header.stamp, [*speeds_mps, *(efforts[i] for i in at)])
 
     def on_fix(message: TwistStamped) -> None:
