@@ -8,9 +8,10 @@ As :mod:`terrain.estimation.health` has it of the filters of swerve robots, of s
     disagrees   speed over ground and accelerometer measure different changes of the speed
     gated       what measures the motion over ground comes, and the filter has believed none of it for as long
 
-A speed over ground changes by what the accelerometer shows: what is left of a sample's change is a jump, or is summed
-up over :data:`~terrain.estimation.health.COMPARED_S`.  A sensor of which nothing has come yet is not judged: what a
-robot does not have is not missed.
+A speed over ground changes by what the accelerometer or the wheels show: what neither shows of a sample's change is a
+jump; what the accelerometer does not is summed up over :data:`~terrain.estimation.health.COMPARED_S`.  Both are judged
+by what is usual while the robot moves, which its first seconds show.  A sensor of which nothing has come yet is not
+judged: what a robot does not have is not missed.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from terrain.estimation.live import LiveEstimate
 from terrain.records import Array, Reading
 from terrain.robots import Robot
 
+FOLLOWING = 1.6  #: Samples that are so many periods apart follow each other.
 LATE_PERIODS = 2.5  #: Of a sensor that is slower, so many of its periods make it lost.
 REPEATED_S, N_REPEATED = 0.15, 2  #: Least time and number of repetitions of a sensor that is frozen.
 BELIEVED_S = 5.0  #: A value that has jumped and stays is believed after this long.
@@ -43,7 +45,7 @@ N_JUMPED = 2
 SPEED_JUMP_MPS, POSITION_JUMP_M = 0.15, 0.5  #: Least jump beyond what accelerometer and wheels show.
 #: A jump over the median change of a speed, and over the deviation of a position; the median at first, and how many
 #: samples move it.  An IMU that is shaken shows the change of a speed to as much.
-JUMPS, JUMP_STD, SCATTER_MPS, N_SCATTER = 7.0, 4.5, 0.06, 25.0
+JUMPS, JUMP_STD, SCATTER_MPS, N_SCATTER = 5.0, 4.5, 0.12, 25.0
 #: Steps for which the accelerometer's integral is remembered: samples come late by a quarter of a second.
 N_GAINED = 32
 SIGNED_MPS = 0.1  #: A robot that is slower may drive in either direction.
@@ -78,14 +80,15 @@ class _Seen:
     """What is remembered of a sensor."""
 
     __slots__ = (
-        *("apart", "came_s", "changed_s", "integral", "jumped", "jumped_s", "longest_s"),
-        *("n_after", "n_same", "period_s", "scatter", "stamp_s", "usual", "value"),
+        *("apart", "came_s", "changed_s", "jumped", "jumped_s", "longest_s"),
+        *("n_after", "n_same", "period_s", "scatter", "shown", "stamp_s", "usual", "value"),
     )
 
     def __init__(self) -> None:
         self.value = np.empty(0)
         self.stamp_s = self.came_s = self.changed_s = self.jumped_s = math.nan
-        self.period_s = self.longest_s = self.apart = self.integral = 0.0
+        self.period_s = self.longest_s = self.apart = 0.0
+        self.shown = np.zeros(2)
         self.scatter = self.usual = SCATTER_MPS
         self.jumped = np.zeros(1)
         self.n_same = self.n_after = 0
@@ -136,7 +139,7 @@ class StreamHealth:
         delays = {"gnss": "gnss_delay_s", **dict.fromkeys(("odometry", "lidar"), "pose_delay_s")}
         self._delays = {stream: states.index(name) for stream, name in delays.items() if name in states}
         self._delay_s = dict.fromkeys(self._delays, 0.0)
-        self._gained: deque[tuple[float, float]] = deque(maxlen=N_GAINED)
+        self._gained: deque[tuple[float, float, float]] = deque(maxlen=N_GAINED)
 
     def step(
         self, now_s: float, dt_s: float, readings: Mapping[str, Reading], motion: LiveEstimate | None
@@ -152,7 +155,9 @@ class StreamHealth:
                 self._gained.clear()
             else:
                 gained_mps = self._gained[-1][1] if self._gained else 0.0
-                self._gained.append((now_s, gained_mps + motion.accel_x_mps2 * dt_s))
+                known = motion.wheel_speed_mps[np.isfinite(motion.wheel_speed_mps)]
+                wheels_mps = float(known.mean()) if known.size else math.nan
+                self._gained.append((now_s, gained_mps + motion.accel_x_mps2 * dt_s, wheels_mps))
             for stream, place in self._delays.items():
                 self._delay_s[stream] = float(motion.mean[place])
             if abs(motion.speed_x_mps) > SIGNED_MPS:
@@ -198,33 +203,34 @@ class StreamHealth:
         is_speed = sensor.name in _SPEEDS
         if sensor.name == "gnss_speed":
             row = np.array([*row, math.copysign(math.hypot(*row), self._ahead)])
-        integral = self._travelled_m
+        shown = np.array([self._travelled_m])
         if is_speed:  # at the sample's own instant, which may be a while ago
-            gained = np.array(self._gained).reshape(-1, 2)
+            gained = np.array(self._gained).reshape(-1, 3).T
             at_s = stamp_s - self._delay_s.get(sensor.stream, 0.0)
-            integral = float(np.interp(at_s, gained[:, 0], gained[:, 1])) if len(gained) else math.nan
+            shown = np.array(
+                [np.interp(at_s, gained[0], row) if row.size else math.nan for row in gained[1:]]
+            )
         before, passed_s = seen.value, stamp_s - seen.stamp_s
         same = before.size > 0 and bool((row[:2] == before[:2]).all())
         if same and seen.n_same + 1 >= N_REPEATED:  # it measures nothing: what it changes by then is no jump
             seen.jumped, seen.apart = np.zeros(1), 0.0
         elif (
-            before.size
-            and 0.0 < passed_s < LATE_PERIODS * max(seen.period_s, 0.1)
-            and seen.n_same < N_REPEATED
+            before.size and 0.0 < passed_s < FOLLOWING * max(seen.period_s, 0.05) and seen.n_same < N_REPEATED
         ):
-            change, by = row - before, integral - seen.integral
+            change, by = row - before, shown - seen.shown
             limit = sensor.jump + sensor.jump_per_s * passed_s
             if is_speed:
-                change = np.nan_to_num(change[-1:] - by)
+                by_accel, by_wheels = (float(one) for one in np.nan_to_num(change[-1] - by))
+                change = np.array([min(by_accel, by_wheels, key=abs)])
                 limit = max(limit, JUMPS * seen.scatter)
-                bounded = min(max(float(change[0]), -limit), limit)
+                bounded = min(max(by_accel, -limit), limit)
                 seen.apart = seen.apart * math.exp(-passed_s / COMPARED_S) + bounded
                 if moves:  # at rest nothing shakes
-                    seen.scatter = _median(seen.scatter, abs(bounded))
+                    seen.scatter = _median(seen.scatter, abs(float(change[0])))
                     seen.usual = _median(seen.usual, abs(seen.apart))
             elif sensor.stream in _REFERENCES:
                 change = change[:2]
-                limit += by + JUMP_STD * math.hypot(*np.nan_to_num([*before[2:], *row[2:]]))
+                limit += float(by[0]) + JUMP_STD * math.hypot(*np.nan_to_num([*before[2:], *row[2:]]))
             self._jump(seen, stamp_s, change, limit)
         if before.size and passed_s > 0.0:
             seen.period_s += (min(passed_s, 1.0) - seen.period_s) * (0.1 if seen.period_s else 1.0)
@@ -233,7 +239,7 @@ class StreamHealth:
                 seen.longest_s = max(seen.longest_s, min(seen.stamp_s - seen.changed_s, REPEATED_S))
             seen.changed_s = stamp_s
         seen.n_same = seen.n_same + 1 if same else 0
-        seen.value, seen.stamp_s, seen.came_s, seen.integral = row, stamp_s, now_s, integral
+        seen.value, seen.stamp_s, seen.came_s, seen.shown = row, stamp_s, now_s, shown
 
     @staticmethod
     def _jump(seen: _Seen, stamp_s: float, change: Array, limit: float) -> None:
