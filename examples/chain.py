@@ -80,7 +80,7 @@ def slips(learn: Sequence[RunLog], held: Sequence[RunLog], robot: Robot, answer:
     currents = [name for name in runs[0].streams["wheels"].channels if name.startswith("current_")]
     measured = terrain.estimate(runs, robot, **options)
     for row in measured.result.surfaces:
-        found = f"{row.slip_ratio:.3f}" if np.isfinite(row.slip_ratio) else "an unknown slip"
+        found = format_value(row.slip_ratio, SLIP) if np.isfinite(row.slip_ratio) else "an unknown slip"
         answer.lead.append(f"{found} on {row.terrain or '(no label)'}")
     answer.lead = [f"{robot.name} slips by {enumerated(answer.lead)}"]
     if lacking := measured.result.not_measured:

@@ -261,7 +261,7 @@ def recall_table(result: CrossvalResult) -> Table:
         Column("precision", PERCENT),
         Column("recall", PERCENT),
         Column("F1", ".3f"),
-        "windows",
+        "windows" if result.repeats == 1 else f"windows, {result.repeats} deals",
     )
     note = "" if len(rows) <= MAX_ROWS else f"the {MAX_ROWS} worst of {len(rows)} terrains"
     return Table(columns, [row for row in rows if row in worst], note=note)

@@ -111,7 +111,10 @@ def findings_of(runs: Sequence[RunLog], description: Any, robot: Robot, hard: Se
     for finding in findings:  # of two about one number the one that has it
         if finding.parameter not in best or finding.determined:
             best[finding.parameter] = finding
-    findings = list(best.values())
+    sees = robot.describes("camera")
+    findings = [
+        each for each in best.values() if sees or each.determined or not each.parameter.startswith("camera.")
+    ]
     for i, finding in enumerate(findings):
         section, _, name = finding.parameter.partition(".")
         if entry := description.get(section, {}).get(name):
