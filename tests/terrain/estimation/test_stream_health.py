@@ -134,3 +134,23 @@ def test_references_that_the_filter_does_not_believe_are_gated():
     found = judged(age_s=lambda time_s: max(time_s - 2.0, 0.0))
     assert all((found[name][-20:] == Health.GATED).all() for name in ("camera_speed", "gnss_speed"))
     assert (found["gyro"] == Health.FRESH).all()
+
+
+def test_what_is_frozen_or_has_jumped_is_kept_from_the_filter_and_nothing_else():
+    judge = StreamHealth(ROBOT, CHANNELS)
+    for sensor, health in (
+        ("tilt", Health.STEPPED),
+        ("gnss_speed", Health.FROZEN),
+        ("accel", Health.DISAGREES),
+    ):
+        judge.health[judge.names.index(sensor)] = health
+    given = {name: Reading(np.zeros(1), np.ones((1, len(channels)))) for name, channels in CHANNELS.items()}
+    readings = dict(given, odometry=Reading(np.zeros(1), np.ones((1, 5))))  # of another robot: left as it is
+    judge.mask(readings)
+    masked = {
+        name: [CHANNELS[name][i] for i in np.flatnonzero(np.isnan(reading.values[0]))]
+        for name, reading in readings.items()
+    }
+    speeds = ["velocity_x_mps", "velocity_y_mps"]
+    assert masked == {"wheels": [], "imu": ["pitch_rad"], "odometry": [], "gnss": speeds}
+    assert all(np.isfinite(reading.values).all() for reading in given.values())
