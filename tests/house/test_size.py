@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MAX_LINES = {"terrain": 57_735, "features": 2_680, "pipelines": 20_239, "tests": 51_325}
+MAX_LINES = {"terrain": 57_735, "features": 2_680, "pipelines": 20_239, "tests": 51_339}
 """Lines of Python, docstrings included."""
 
 
