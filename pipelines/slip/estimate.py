@@ -26,8 +26,8 @@ EXAMPLE = "terrain estimate --data raw/ --filter vio15 --out runs/"
 RESULTS = ("pipelines.slip.filtered", "pipelines.slip.observed", "pipelines.slip.measured")
 """Modules of the modes, with their results."""
 
-ByFilter = Literal["encoder12", "vio12", "vio15", "skid"]
-"""Filters, the numbers being those of their states."""
+ByFilter = Literal["encoder12", "vio12", "vio15"]
+"""Filters of swerve robots, the numbers being those of their states."""
 
 ByObserver = Literal[
     "slip",

@@ -33,7 +33,6 @@ from terrain.estimation.estimate import (
     summarize,
     tuning_of,
 )
-from terrain.estimation.models.skid import stuck_intervals
 from terrain.kinematics.wheels import no_slip_twist
 from terrain.records import GATED, Array, RunLog
 from terrain.robots import Robot, robot_named
@@ -50,7 +49,6 @@ class FilterResult(TracksResult, kw_only=True):
     tuning: str = described("source of its noise: physical, thesis or likelihood")
     tuned: TunedNoise | None = described("what the tuning 'likelihood' did; none with another")
     runs: tuple[EstimateSummary, ...] = described("figures of each run; slip positive in traction")
-    clocks: tuple[str, ...] = described("a sentence where wheels and IMU of runs do not share a clock")
 
 
 def estimate_all(
@@ -78,19 +76,7 @@ def estimate_all(
         found = estimate_run(run, robot_of(run), name, tuning=tuning, process_variance=variance)
         return summarize(found), enriched(found), partial(figures_of, found)
 
-    found = estimate_each(runs, name, estimate, progress, keep)
-    clocks: tuple[str, ...] = ()
-    if name == "skid":  # the turns of a robot that skids show where the clocks of wheels and IMU are apart
-        from terrain.logs.clock import offsets_apart_s
-
-        if apart := offsets_apart_s(runs, lambda run: robot_of(run).track_m):
-            worst = max(apart, key=lambda run_id: abs(apart[run_id]))
-            clocks = (
-                f"the clocks of wheels and IMU are apart in {len(apart)} of {len(runs)} runs, by "
-                f"{apart[worst]:+.2f} s in {worst}: tracks and yaw rates of these are wrong; --align brings the wheels "
-                "onto the IMU's clock",
-            )
-    return FilterResult(**found, tuning=tuning, tuned=tuned, clocks=clocks)
+    return FilterResult(**estimate_each(runs, name, estimate, progress, keep), tuning=tuning, tuned=tuned)
 
 
 RUNS = (
@@ -120,28 +106,18 @@ def report(result: FilterResult) -> Report:
     """Return slip, its truth where it is known, and how consistent the filter was."""
     blind = not all(row.slip_observable for row in result.runs)
     columns = [each for each in RUNS if blind or each.title != "observed"]
-    parts: list[Part] = [Text(sentence, "warning") for sentence in result.clocks]
+    parts: list[Part] = []
     if blind:
         parts.append(Text(BLIND, "note"))
     if (tuned := result.tuned) is not None:
         scales = [f"{name} {scale:.3g} ({tuned.status[name]})" for name, scale in tuned.scales.items()]
         parts.append(Text(f"Process variances scaled on {', '.join(tuned.runs)}: {', '.join(scales)}."))
-    motions = []
-    for row in result.runs:
-        if (motion := row.motion) is not None:
-            times = ", ".join(f"{each.start_s:.1f} to {each.end_s:.1f} s" for each in row.stuck or ())
-            motions.append(
-                f"{row.run_id}: {f'stuck from {times}' if times else 'not seen to be stuck'}; moving for "
-                f"{motion['moving']:.1f} s, at rest for {motion['at_rest']:.1f} s, unknown for "
-                f"{motion['unknown']:.1f} s"
-            )
     return tracks_report(
         result,
         f"Motion and slip by {result.filter}",
         _answer(result),
         (result.runs, columns, f"filter {result.filter}, {result.tuning} noise"),
-        ("At rest, moving, stuck", motions),
-        parts,
+        parts=parts,
     )
 
 
@@ -155,36 +131,26 @@ def _answer(result: FilterResult) -> str:
         )
         deviation = format_value(std, ".4f")
         return f"Slip in steady motion is {slip} in {n}, with a standard deviation of at most {deviation}."
-    if any(row.motion is not None for row in result.runs):
-        n_stuck = sum(bool(row.stuck) for row in result.runs)
-        stuck = f"stuck in {n_stuck} of them" if n_stuck else "not seen to be stuck"
-        return f"Motion of {n} is estimated without slip; the robot was {stuck}."
     return f"Motion of {n} is estimated; slip is not known in steady motion."
 
 
 LABELS = {
-    "speed_mps": "speed [m/s]",
     "speed_x_mps": "longitudinal speed [m/s]",
     "speed_y_mps": "lateral speed [m/s]",
     "yaw_rate_radps": "yaw rate [rad/s]",
-    "effective_track_m": "effective track [m]",
 }
 """States that are drawn, of the filters that have them."""
 
 
 def figures_of(estimate: Estimate) -> dict[str, Figure]:
-    """Return ``<run>_motion`` and, where there is slip to show, ``<run>_slip``."""
-    run_id, motion = estimate.run.run_id, motion_figure(estimate)
-    slip = {} if estimate.name == "skid" else {f"{run_id}_slip": slip_figure(estimate)}
-    return {f"{run_id}_motion": motion, **slip}
+    """Return ``<run>_motion`` and ``<run>_slip``."""
+    run_id = estimate.run.run_id
+    return {f"{run_id}_motion": motion_figure(estimate), f"{run_id}_slip": slip_figure(estimate)}
 
 
 def motion_figure(estimate: Estimate) -> Figure:
-    """Show motion as estimated, as sensors measured it and as it was, when a robot was stuck, and innovations."""
-    track, table, name, stuck = estimate.track, estimate.table, estimate.name, []
-    if name == "skid":
-        intervals = stuck_intervals(track.time_s, np.asarray(estimate.motion))
-        stuck = [Strip([(each.start_s, each.end_s, "stuck") for each in intervals])]
+    """Show motion as estimated, as sensors measured it and as it was, and innovations."""
+    track, table, name = estimate.track, estimate.table, estimate.name
     panels = []
     for state, sensors in _measured(estimate).items():
         marks: list[Mark] = [
@@ -193,12 +159,9 @@ def motion_figure(estimate: Estimate) -> Figure:
         true = None if estimate.truth is None else estimate.truth[:, track.states.index(state)]
         known = true if true is not None and np.isfinite(true).any() else None
         marks += estimated(name, track.time_s, track.state(state), track.std(state), 2, known)
-        panels.append(Panel([*marks, *stuck], LABELS[state]))
-    rows = ["gyro_z_radps"] if name != "skid" else []
-    if name in SEEING:
-        rows = [f"camera_{state}" for state in LABELS if state in track.states]
-    innovations = estimate.innovations if rows else {}
-    for row in rows:
+        panels.append(Panel(marks, LABELS[state]))
+    innovations = estimate.innovations
+    for row in [f"camera_{state}" for state in LABELS] if name in SEEING else ["gyro_z_radps"]:
         value, std = innovations[row]
         sensor = next(k for k, (_, names) in enumerate(estimate.model.sensors) if row in names)
         gated = track.use[:, sensor] == GATED
@@ -219,7 +182,7 @@ def motion_figure(estimate: Estimate) -> Figure:
         f"{estimate.run.run_id}: motion by {name}",
         panels,
         "Estimates with two standard deviations beside the sensors; the truth behind the same low-pass. "
-        "Innovations, where there are any, beside the two standard deviations that the filter expected of them.",
+        "Innovations beside the two standard deviations that the filter expected of them.",
         x_label="time [s]",
     )
 
@@ -228,14 +191,6 @@ def _measured(estimate: Estimate) -> dict[str, dict[str, Array]]:
     """Return by state what the sensors say of it (n,)."""
     table, robot = estimate.table, estimate.robot
     gyro = {"gyro": table.columns(["gyro_z_radps"])[:, 0]}
-    if estimate.name == "skid":
-        left, right = table.columns(["wheel_left_mps", "wheel_right_mps"]).T
-        turn = {f"wheels over {robot.track_m:g} m": (right - left) / robot.track_m, **gyro}
-        return {
-            "speed_mps": {"mean of the wheels": (left + right) / 2},
-            "yaw_rate_radps": turn,
-            "effective_track_m": {},
-        }
     rates = table.columns([f"wheel_{wheel}_radps" for wheel in robot.wheels])
     steer = table.columns([f"steer_{wheel}_rad" for wheel in robot.wheels])
     twist = no_slip_twist(robot.wheel_positions_m, steer, robot.wheel_radius_m * rates)[0]

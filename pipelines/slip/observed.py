@@ -1,4 +1,4 @@
-"""``terrain estimate`` by an observer of slip, of tracked and car-like robots."""
+"""``terrain estimate`` by an observer of slip, of robots of any drive."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from pipelines.report.figure import Figure, Line, Mark, Panel, Points, Strip, spans
 from pipelines.report.numbers import enumerated, format_value, plural
 from pipelines.report.results import Progress, described
-from pipelines.report.tree import Column, Report
+from pipelines.report.tree import Column, Report, Text
 from pipelines.slip.estimate import EstimateOptions
 from pipelines.slip.tracks import (
     SLIP,
@@ -37,6 +37,7 @@ from terrain.estimation.observe import (
     summarize_observer,
     with_estimates,
 )
+from terrain.logs.clock import offsets_apart_s
 from terrain.records import Array, RunLog
 from terrain.robots import Robot, robot_named
 
@@ -50,6 +51,7 @@ class ObserverResult(TracksResult, kw_only=True):
     filter: str = described("which observer")
     slip_model: Path | None = described("file of the slip model that it has")
     runs: tuple[ObserverSummary, ...] = described("figures of each run; slip positive in traction")
+    clocks: tuple[str, ...] = described("a sentence where wheels and IMU of runs do not share a clock")
 
 
 def estimate_all(
@@ -65,12 +67,26 @@ def estimate_all(
     if file is not None and name not in (*BY_MODEL, "encoder-odometry"):
         raise ConfigError(f"filter {name!r} takes no slip model: leave --slip-model out")
 
+    def robot_of(run: RunLog) -> Robot:
+        return robot or robot_named(run.robot)
+
     def observe(run: RunLog) -> tuple[Any, RunLog, Pictures]:
-        own = robot or robot_named(run.robot)
+        own = robot_of(run)
         found = observe_run(run, own, name, None if file is None else read_slip_model(file, own.name))
         return summarize_observer(found), with_estimates(found), partial(figures_of, found)
 
-    return ObserverResult(**estimate_each(runs, name, observe, progress, keep), slip_model=file)
+    found = estimate_each(runs, name, observe, progress, keep)
+    # the turns of a robot that skids show where the clocks of wheels and IMU are apart
+    skidding = [run for run in runs if name == "slip" and robot_of(run).skids]
+    clocks: tuple[str, ...] = ()
+    if apart := offsets_apart_s(skidding, lambda run: robot_of(run).track_m):
+        worst = max(apart, key=lambda run_id: abs(apart[run_id]))
+        clocks = (
+            f"the clocks of wheels and IMU are apart in {len(apart)} of {len(runs)} runs, by "
+            f"{apart[worst]:+.2f} s in {worst}: yaw rates and slip in turns of these are wrong; --align brings the "
+            "wheels onto the IMU's clock",
+        )
+    return ObserverResult(**found, slip_model=file, clocks=clocks)
 
 
 SLIPS = (
@@ -107,6 +123,7 @@ def report(result: ObserverResult) -> Report:
         _answer(result),
         (rows, SLIPS, "slip by run"),
         ("Statuses", statuses),
+        [Text(sentence, "warning") for sentence in result.clocks],
     )
 
 

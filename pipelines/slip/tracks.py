@@ -64,7 +64,7 @@ def tracks_report(
     title: str,
     answer: str,
     rows: tuple[Sequence[Any], Sequence[Column], str],
-    texts: tuple[str, Sequence[str]],
+    texts: tuple[str, Sequence[str]] = ("", ()),
     parts: Sequence[Part] = (),
 ) -> Report:
     """Return the report of a filter or an observer, which leads with the slip of the first run that has one.
@@ -74,7 +74,7 @@ def tracks_report(
     result : with its ``filter``, ``out``, ``pictures`` and ``skipped``
     title, answer, parts : of the report, ``parts`` after its table
     rows : of its table, with its columns, of which those of a truth that no run has are left out, and its title
-    texts : a section of the details
+    texts : a section of the details; empty for none
     """
     records, columns, heading = rows
     first, all_rows = first_rows(records, known_columns(columns, records), heading)

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -16,9 +16,12 @@ from terrain.discrepancy.health.fault import Fault
 from terrain.discrepancy.runs import LowPass, Signals, Simulation, rows_of
 from terrain.effects import CHANNELS
 from terrain.errors import DataError, NotTakenWarning, TerrainError
-from terrain.estimation.estimate import Estimate, estimate_run, summarize
-from terrain.records import Array, RunLog
+from terrain.estimation.estimate import estimate_run, summarize
+from terrain.records import Array, RunLog, StateTrack
 from terrain.robots import Robot
+
+if TYPE_CHECKING:
+    from terrain.estimation.models.observer import ObserverTrack
 
 HOLD_OUT_FROM, HOLD_OUT_EVERY = 24, 4
 """With so many runs or more, one in every so many is held out; of fewer a quarter is too few to judge on."""
@@ -103,8 +106,8 @@ def repair_held_out(
 
 # -- What an extension gains for the robot's filter, against the truth of runs that have one ---------------
 
-FILTERS = {"swerve": "vio12", "skid_steer": "skid", "tracked": "skid"}
-"""By kind of drive, the filter whose errors are compared."""
+FILTERS = {"swerve": "vio12", "skid_steer": "slip", "tracked": "slip"}
+"""By kind of drive, the filter or observer whose errors are compared."""
 
 ERRORS = ("speed_mps", "yaw_rate_radps", "slip_ratio")
 """Errors that are compared: root mean squares of speed and yaw rate, and the error of the mean slip."""
@@ -146,7 +149,7 @@ def filter_gain(runs: Sequence[RunLog], robot: Robot, extended: Simulation, seed
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotTakenWarning)  # the errors show it
-            rows = [[_errors(estimate_run(run, one, name)) for one in (robot, better)] for run in known]
+            rows = [[_errors(run, one, name) for one in (robot, better)] for run in known]
     except TerrainError as error:
         return Comparison(name, str(error), len(known), {})
     errors = {}
@@ -158,19 +161,31 @@ def filter_gain(runs: Sequence[RunLog], robot: Robot, extended: Simulation, seed
     return Comparison(name, None, len(rows), errors)
 
 
-def _errors(estimate: Estimate) -> tuple[float, ...]:
+def _errors(run: RunLog, robot: Robot, name: str) -> tuple[float, ...]:
     """Return the errors of a run, in the order of :data:`ERRORS`."""
-    summary, track, truth = summarize(estimate), estimate.track, estimate.run.streams["truth"]
-    squares = dict.fromkeys(("speed", "yaw_rate"), np.zeros(len(track.time_s)))
-    for state in track.states:
-        kind = state.removesuffix("_mps").removesuffix("_radps").removesuffix("_x").removesuffix("_y")
-        if kind in squares:
-            true = truth.channel("speed_x_mps" if state == "speed_mps" else state)
-            error = track.state(state) - np.interp(track.time_s, truth.time_s, true)
-            squares[kind] = squares[kind] + error**2
-    rms = [math.sqrt(float(np.nanmean(square))) for square in squares.values()]
-    slip_error = abs(summary.slip_mean - summary.slip_true_mean)
-    return (*rms, slip_error if summary.slip_observable else math.nan)
+    track: StateTrack | ObserverTrack
+    if name == "slip":
+        from terrain.estimation.observe import (
+            observe_run,
+            summarize_observer,
+        )  # with kernels others do not need
+
+        observed = observe_run(run, robot, name)
+        slips = summarize_observer(observed).slip.values()
+        track, slip_error = (
+            observed.track,
+            float(np.mean([abs(each.mean - each.true_mean) for each in slips])),
+        )
+    else:
+        found = estimate_run(run, robot, name)
+        summary, track = summarize(found), found.track
+        error = abs(summary.slip_mean - summary.slip_true_mean)
+        slip_error = error if summary.slip_observable else math.nan
+    truth, squares = run.streams["truth"], []
+    for state in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"):
+        true = np.interp(track.time_s, truth.time_s, truth.channel(state))
+        squares.append(float(np.nanmean((track.state(state) - true) ** 2)))
+    return math.sqrt(squares[0] + squares[1]), math.sqrt(squares[2]), slip_error
 
 
 def accuracy_change(before: Array, after: Array, run_id: Array, seed: int) -> Change:

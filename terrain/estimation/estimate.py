@@ -18,7 +18,7 @@ from terrain.estimation.filter import (
     FilterSettings,
     run_filter,
 )
-from terrain.estimation.models import skid, swerve
+from terrain.estimation.models import swerve
 from terrain.estimation.wheel_slip import SlipFigures, slip_figures, wheel_slip
 from terrain.extension import check_corrected, correct
 from terrain.kinematics.logged_wheels import with_wheel_speeds
@@ -26,17 +26,7 @@ from terrain.logs.schema import ESTIMATOR_CHANNELS
 from terrain.records import GATED, USED, Array, RunLog, SlipTrack, StateTrack, Stream
 from terrain.robots import Robot
 
-FILTERS = (*swerve.FILTERS, "skid")  #: Names of the filters; the numbers are those of their states.
-#: Filters of each drive.
-FILTERS_OF_DRIVE: Mapping[str, tuple[str, ...]] = {
-    "swerve": swerve.FILTERS,
-    "skid_steer": ("skid",),
-    "tracked": ("skid",),
-    "omni": (),
-    "mecanum": (),
-    "bicycle": (),
-    "tricycle": (),
-}
+FILTERS = swerve.FILTERS  #: Names of the filters, of swerve robots; the numbers are those of their states.
 #: Noise in natural units; the thesis' own (6.13), (6.14), with its smoothing and without gates; process noise fitted
 #: to chosen runs.
 TUNINGS = ("physical", "thesis", "likelihood")
@@ -71,15 +61,6 @@ class Estimate:
     def innovations(self) -> dict[str, tuple[Array, Array]]:
         """By row the measurement minus the prediction at each instant (n,), and its expected standard deviation."""
         return innovations(self.model, self.track, self.table.columns(self.model.rows), *self.scheduled)
-
-    @property
-    def motion(self) -> Array | None:
-        """The :class:`~terrain.estimation.models.skid.Motion` (n,) at each instant; None of robots that steer."""
-        if self.name != "skid":
-            return None
-        turn, bias_std = self.track.state("yaw_rate_radps"), self.track.std("gyro_bias_radps")
-        measured = self.table.columns(skid.WHEELS_AND_GYRO)
-        return skid.motion_track(self.track.time_s, measured, turn, bias_std, self.robot.track_m)
 
 
 def estimate_run(
@@ -133,11 +114,7 @@ def estimate_run(
     samples = swerve.scheduled(model, table.z, table.gnss_variance, is_physical)
     settings = FilterSettings(1.0 if tuning == "thesis" else GATE_PROBABILITY, REOPEN_AFTER_S)
     track = run_filter(model, table.time_s, table.columns(model.rows), settings, *samples)
-    if name == "skid":
-        track = replace(track, mean=skid.within_bounds(track.mean, driven.track_m))
-        speed_mps = track.state("speed_mps")
-    else:
-        speed_mps = np.hypot(track.state("speed_x_mps"), track.state("speed_y_mps"))
+    speed_mps = np.hypot(track.state("speed_x_mps"), track.state("speed_y_mps"))
     kept = np.searchsorted(table.time_s, track.time_s)
     scheduled = tuple(None if part is None else part[kept] for part in samples)
     table = table.at(track.time_s)
@@ -154,17 +131,14 @@ def estimate_run(
 def model_of(run: RunLog, robot: Robot, name: str, tuning: str | None = None) -> FilterModel:
     """Return the filter for a corrected run, with the noise that it starts from; errors as :func:`estimate_run`."""
     check_corrected(robot)
-    of_drive, chosen = FILTERS_OF_DRIVE[robot.drive], robot.filters
-    if name in FILTERS and (name not in of_drive or (chosen and name not in chosen)):
+    if name in FILTERS and (robot.drive != "swerve" or (robot.filters and name not in robot.filters)):
         from terrain.estimation.models.choice import observers_of  # has kernels that filters do not need
 
-        suitable = [each for each in of_drive if not chosen or each in chosen]
-        fits = ", ".join((*suitable, *observers_of(robot))) or "pose"
+        own = FILTERS if robot.drive == "swerve" else ()
+        fits = ", ".join((*(each for each in own if each in robot.filters), *observers_of(robot)))
         raise ConfigError(
             f"filter {name!r} is not for robot {robot.name}, whose drive is {robot.drive}: use {fits}"
         )
-    if name == "skid":
-        return skid.make_skid_filter(robot)
     is_thesis = tuning_of(name, tuning) == "thesis"
     has_gnss = not is_thesis and "gnss" in run.streams and len(run.streams["gnss"]) > 0
     return swerve.make_filter(name, robot, has_gnss, is_thesis)
@@ -183,9 +157,8 @@ def enriched(estimate: Estimate) -> RunLog:
 
     Wheel speeds join the stream ``wheels``.  New are ``slip``; ``estimator``, the states that windows are
     made of; and ``state``, of which no features are made: every state and ``std_<state>``,
-    ``std_slip_<wheel>_ratio``, ``stale_ratio`` (1 where the speed over ground was not measured lately),
-    ``stuck_ratio`` (1 where the robot is stuck, NaN where that is unknown) and ``nis_<sensor>_ratio``; a column
-    without any finite value is left out.
+    ``std_slip_<wheel>_ratio``, ``stale_ratio`` (1 where the speed over ground was not measured lately) and
+    ``nis_<sensor>_ratio``; a column without any finite value is left out.
     """
     track, slip = estimate.track, estimate.slip
     columns = dict(zip(track.states, track.mean.T, strict=True))
@@ -194,8 +167,6 @@ def enriched(estimate: Estimate) -> RunLog:
     for wheel, std in zip(slip.wheels, slip.slip_std.T, strict=True):
         columns[f"std_slip_{wheel}_ratio"] = std
     columns["stale_ratio"] = slip.stale.astype(float)
-    if (motion := estimate.motion) is not None:
-        columns["stuck_ratio"] = np.where(motion == skid.Motion.UNKNOWN, np.nan, motion == skid.Motion.STUCK)
     for sensor, nis in zip(track.sensors, track.nis.T, strict=True):
         columns[f"nis_{sensor}_ratio"] = nis
     return with_tracks(estimate.run, estimate.robot, estimate.name, track.time_s, columns, slip.as_stream())
@@ -249,14 +220,11 @@ class EstimateSummary:
     n_gated: int
     dropped: Mapping[str, int]
     finite: bool  #: whether all states and covariances are finite
-    #: time that the robot was at rest, moving, stuck, and neither is known; None of a filter that does not judge it
-    motion: Mapping[str, float] | None
-    stuck: tuple[skid.StuckInterval, ...] | None  #: when it was stuck, None as ``motion``
 
 
 def summarize(estimate: Estimate) -> EstimateSummary:
     """Return the figures of an estimate."""
-    track, slip, figures, motion = estimate.track, estimate.slip, estimate.figures, estimate.motion
+    track, slip, figures = estimate.track, estimate.slip, estimate.figures
     truth, used = estimate.truth, track.use == USED
     steps_s = np.diff(track.time_s, append=track.time_s[-1:])
     mean_nees = speed_rmse_mps = math.nan
@@ -295,8 +263,6 @@ def summarize(estimate: Estimate) -> EstimateSummary:
         n_gated=int((track.use == GATED).sum()),
         dropped=dropped,
         finite=bool(np.isfinite(track.mean).all() and np.isfinite(track.cov).all()),
-        motion=None if motion is None else skid.motion_seconds(track.time_s, motion),
-        stuck=None if motion is None else skid.stuck_intervals(track.time_s, motion),
     )
 
 

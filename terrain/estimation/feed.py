@@ -1,4 +1,4 @@
-"""From samples of sensors to the row of measurements at each tick of the wheels, on one clock and with one delay.
+"""From samples of a swerve robot to the row of measurements at each tick of its wheels, on one clock, with one delay.
 
 The clock is that of the wheels, whose rates pass the low-pass of the motor driver.  A ground speed that
 is ahead of them makes the slip of a start look negative (Danzi, AgriMaRo thesis, 7.2.2), so every other
@@ -9,8 +9,7 @@ signal goes through a low-pass too, and its own lag and the filter's together ar
 3. a low-pass, at each sensor's own rate (:func:`terrain.signals.low_pass_step`);
 4. at each tick the last sample at or before it, unless it is too old; the low-pass runs on to the tick with
    that sample as its input, which leaves no delay of the holding;
-5. rows that follow from others: vibration, changes of the wheels' speeds, rest; of a robot that skids the
-   gyro's mean since the last tick.
+5. rows that follow from others: vibration, changes of the wheels' speeds, rest.
 
 A whole log (:func:`measurement_table`) and the live chain (:class:`~terrain.estimation.live.LiveFilter`) take one
 compiled loop (:func:`run_feed`), live over one tick.  What looks ahead in a log is the cleaning, which leaves out and
@@ -30,14 +29,6 @@ Rows that follow from others
   stood behind their low-passes, gyro and accelerometer have measured nothing, and a camera, if it measures, no
   speed.  Locked wheels that slide decelerate the robot: on ice (0.05 of its weight) by more than what counts as
   nothing.
-
-Of a robot that skids, wheels at 6 Hz leave 15 samples of a gyro at 100 Hz between two ticks.  One of them is
-the yaw rate with all of its vibration; their mean is what the heading changed by.  So the row is the integral
-of the low-passed samples, straight from one to the next, over its time; and where no sample came since, the
-value held.  At rest the yaw rate is zero, and a gyro reads its bias.  Rest is wheels that stand for
-:data:`REST_S` and a gyro that is steady all the while: that of a robot that slides, or is towed with its
-wheels held, is not.  ``rest_gyro`` is its mean over all of that time, once, so that a turn that just begins is
-a small part of it.
 
 A yaw row is ``initial_yaw_rad`` on average while the robot is at rest at the start, or at its first sample.
 A camera that starts late takes the IMU's yaw of that instant instead, and after a loss the turn nearest to
@@ -108,13 +99,6 @@ REST_WHEEL_MPS, REST_TURN_RADPS, REST_ACCEL_MPS2, REST_SEEN_MPS = 0.02, 0.03, 0.
 UNSEEN_AFTER_S = 0.15  #: Age of the camera's speed from which on there is none.
 #: Without a camera a change of a wheel's speed counts for so long: the body, and slip, follow it late.
 HELD_S = 0.5
-REST_S = 1.0  #: So long wheels and gyro have to be steady: a robot that stops still rocks for half of it.
-#: Wheel circumferential speed below which a side stands: a few steps of an encoder in a sample.
-STANDING_MPS = 0.01
-#: Largest range of a gyro that is at rest. Measured at rest its samples scatter by 0.002 rad/s (Husky on snow); an
-#: engine or wind that shakes the robot by more makes it unknown whether it rests.
-STEADY_RADPS = 0.02
-MAX_READING_RADPS = 0.1  #: No gyro has a larger bias: a robot on a turntable is not at rest.
 #: Where the channels of the IMU, the camera, its speed in the body's axes and the motors begin among those that may
 #: freeze.
 FIRST_IMU, FIRST_CAMERA, FIRST_SPEED, FIRST_WHEEL = 0, 9, 23, 25
@@ -184,20 +168,16 @@ DERIVED_ROWS = (
     *("wheel_1_change_m2ps3", "wheel_2_change_m2ps3", "wheel_3_change_m2ps3"),
     *("camera_age_s", "ground_slip_ratio", "rest_speed_x_mps", "rest_speed_y_mps", "rest_yaw_rate_radps"),
 )
-SIDE_ROWS = ("wheel_left_mps", "wheel_right_mps")
-REST_ROW = "rest_gyro_radps"
-#: Names of all numbers of a row, in its order, behind which stand the variances of :data:`GNSS_ROWS`; NaN where
-#: nothing is measured.
-ROWS = (*_WHEEL_ROWS, *list(SIGNALS)[:-2], *DERIVED_ROWS, *SIDE_ROWS, REST_ROW)
-N_NUMBERS = len(ROWS) + len(GNSS_ROWS)
-_SIDES = (*SIDE_ROWS, "gyro_z_radps", *GNSS_ROWS, REST_ROW)
-ROWS_OF_DRIVE: dict[str, tuple[str, ...]] = {"swerve": ROWS[:-3], "skid_steer": _SIDES, "tracked": _SIDES}
-"""Rows that a drive measures, of a swerve robot in the order of (6.3).
+ROWS = (*_WHEEL_ROWS, *list(SIGNALS)[:-2], *DERIVED_ROWS)
+"""What is measured, in the order of (6.3).
 
 Positions and GNSS speeds are in the world frame, east and north from where the antenna first was; yaw counts
 from east once the heading at the start is given; all else is in body axes."""
 
-#: Where signals stand among all of them, the signals among the rows, and the derived rows and the others among these.
+#: Numbers of a row: behind the rows stand the variances of :data:`GNSS_ROWS`; NaN where nothing is measured.
+N_NUMBERS = len(ROWS) + len(GNSS_ROWS)
+
+#: Where signals stand among all of them, the signals among the rows, and the derived rows among these.
 ACCEL, GYRO, IMU_YAW, STEER, SEEN, SEEN_TURN, SEEN_YAW, POSITION, TILT = map(
     list(SIGNALS).index,
     (
@@ -205,11 +185,11 @@ ACCEL, GYRO, IMU_YAW, STEER, SEEN, SEEN_TURN, SEEN_YAW, POSITION, TILT = map(
         *("camera_yaw_rate_radps", "camera_yaw_rad", "gnss_position_x_m", "roll_rad"),
     ),
 )
-FIRST_SIGNAL, VIBRATION, GROWTH, CHANGE, SEEN_AGE, GROUND_SLIP, REST_TWIST, SIDE, REST_GYRO = map(
+FIRST_SIGNAL, VIBRATION, GROWTH, CHANGE, SEEN_AGE, GROUND_SLIP, REST_TWIST = map(
     ROWS.index,
     (
         *("accel_x_mps2", "vibration_mps2", "wheel_1_growth_per_s", "wheel_1_change_m2ps3", "camera_age_s"),
-        *("ground_slip_ratio", "rest_speed_x_mps", "wheel_left_mps", REST_ROW),
+        *("ground_slip_ratio", "rest_speed_x_mps"),
     ),
 )
 _GYRO, _YAW, _SEEN, _SEEN_YAW = (FIRST_SIGNAL + np.array([GYRO, IMU_YAW, SEEN, SEEN_YAW])).tolist()
@@ -237,7 +217,7 @@ _TURN = record(numbers("last_rad turned_rad"))
 #: arrival, and is taken without a look at those after it; the smoothing of the thesis, 0 for none.
 SETTINGS = record(
     {"limits": (LIMIT, len(SIGNALS)), "latency_s": (float, len(STREAMS))}
-    | {"is_steered": bool, "is_causal": bool, "is_live": bool}
+    | {"is_causal": bool, "is_live": bool}
     | numbers("reduction_ratio fastest_radps wheel_radius_m initial_yaw_rad gyro_bias_radps ema_alpha")
     | {"wheels_m": (float, (3, 2)), "camera_m": (float, 2)}
     | dict.fromkeys(("steering_zeros_rad", "accel_bias_mps2", "accel_scale_ratio"), (float, 3))
@@ -247,7 +227,7 @@ COUNTS = ("not_finite", "frozen", "low_confidence", "no_rotation", "jump")
 #: What a clock that is set back makes worthless.
 _OF_TIME = [
     *("lines", "before", "received_s", "wheel_once_mps", "wheel_twice_mps", "wheel_change_m2ps3"),
-    *numbers("vibration_square vibration_s tick_s rest_since_s camera_s gyro_angle_rad gyro_time_s"),
+    *numbers("vibration_square vibration_s tick_s rest_since_s camera_s"),
 ]
 FEED = record(
     {"lines": (LINE, len(SIGNALS)), "turns": (_TURN, 5), "channels": (CHANNEL, REPEATED.size)}
@@ -258,16 +238,14 @@ FEED = record(
     | {"received_s": (float, (2, 3)), "smooth": (float, len(CAMERA_ROWS))}
     | {"start_s": float, "has_moved": bool, "camera_has_started": bool, "camera_offset_rad": float}
     | {"yaw_sum_rad": (float, 2), "n_yaw": (int, 2)}
-    | numbers("gyro_angle_rad gyro_time_s standing_s gyro_low_radps gyro_high_radps gyro_sum_radps")
-    | {"n_gyro": int, "wheels_not_finite": int, "wheels_beyond": int}
+    | {"wheels_not_finite": int, "wheels_beyond": int}
     | dict.fromkeys(COUNTS, (int, len(STREAMS)))
 )
 """All that is remembered of the samples: a copy is a snapshot.
 
 The signals; turns of the steering, the IMU and the camera; channels that may freeze; the last complete sample of IMU
 and camera; positions' origin and variance; what the derived rows need; when rate and angle of each wheel were measured
-last; the thesis' smoothing; the yaw of IMU and camera at the start; the gyro since the last tick, and at rest; and
-counts of what was left out."""
+last; the thesis' smoothing; the yaw of IMU and camera at the start; and counts of what was left out."""
 
 _kernel, _inner = njit(error_model="numpy"), inner(error_model="numpy")
 
@@ -294,7 +272,6 @@ def feed_settings(
     settings = filled(
         SETTINGS,
         latency_s=[0.0, sensors.imu_latency_s, camera.latency_s, GNSS_LATENCY_S],
-        is_steered=robot.steered,
         reduction_ratio=motors.reduction_ratio,
         fastest_radps=MAX_RATE_FACTOR * motors.speed_max_radps,
         wheel_radius_m=robot.wheel_radius_m,
@@ -320,8 +297,7 @@ def feed_settings(
         limits = low_pass_s, period_s.get(signal.stream, math.nan), period_s["wheels"]
         if k >= TILT:
             limits = 0.0, 0.02, 0.0
-        judged = robot.steered or k >= TILT or name == "gyro_z_radps"
-        settings["limits"][0, k] = _limit(*limits, signal if judged else Signal(signal.stream))
+        settings["limits"][0, k] = _limit(*limits, signal)
     return settings
 
 
@@ -334,7 +310,7 @@ def _limit(time_constant_s: float, period_s: float, tick_s: float, signal: Signa
 
 def new_feed() -> Array:
     """Return the memory before the first sample."""
-    nothing = dict.fromkeys(("camera_offset_rad", "yaw_sum_rad", "gyro_angle_rad", "gyro_time_s"), 0.0)
+    nothing = dict.fromkeys(("camera_offset_rad", "yaw_sum_rad"), 0.0)
     feed = filled(FEED, np.nan, received_s=-np.inf, slip_square=GROUND_SLIP_RATIO**2, **nothing)
     feed["channels"]["repeated"] = feed["channels"]["longest"] = 0.0
     return feed
@@ -550,11 +526,8 @@ def _take_sample(
     jumped = False
     for k in range(_SPANS[stream, 1] - 1, _SPANS[stream, 0] - 1, -1):  # of the camera its yaw first
         line, limit = feed.lines[k], settings.limits[k]
-        before_s, before, jumped_by = line.instant_s, line.low_passed, line.jumped_by
+        jumped_by = line.jumped_by
         jumped |= _take(signals[k], instant_s, came_s, line, limit)
-        if k == GYRO and 0.0 < line.instant_s - before_s <= limit.gap_s:  # the angle since the last tick
-            feed.gyro_angle_rad += 0.5 * (before + line.low_passed) * (line.instant_s - before_s)
-            feed.gyro_time_s += line.instant_s - before_s
         if (
             k == SEEN_YAW and line.jumped_by != jumped_by
         ):  # that turns the speeds: they have not jumped themselves
@@ -640,31 +613,6 @@ def _derive(time_s: float, settings: Any, feed: Any, row: Any) -> None:
                 line.jumped_by, line.jumped_s = 0.0, np.nan
 
 
-@_kernel
-def rest_at(time_s: float, left_mps: float, right_mps: float, gyro_radps: float, feed: Any) -> float:
-    """Return the mean of the gyro over the last :data:`REST_S` at rest, once for each such time; else NaN.
-
-    A stamp that was set back starts anew; measurements are NaN where there is none.
-    """
-    stands = abs(left_mps) < STANDING_MPS and abs(right_mps) < STANDING_MPS
-    if not (stands and abs(gyro_radps) < MAX_READING_RADPS):
-        feed.standing_s = np.nan
-        return np.nan
-    low, high = min(feed.gyro_low_radps, gyro_radps), max(feed.gyro_high_radps, gyro_radps)
-    if not (high - low <= STEADY_RADPS and time_s > feed.standing_s):
-        feed.standing_s, feed.n_gyro = time_s, 1
-        feed.gyro_low_radps = feed.gyro_high_radps = feed.gyro_sum_radps = gyro_radps
-        return np.nan
-    feed.gyro_low_radps, feed.gyro_high_radps = low, high
-    feed.gyro_sum_radps += gyro_radps
-    feed.n_gyro += 1
-    if time_s - feed.standing_s < REST_S - TICK_S:
-        return np.nan
-    mean_radps = feed.gyro_sum_radps / feed.n_gyro
-    feed.standing_s, feed.gyro_sum_radps, feed.n_gyro = time_s, 0.0, 0
-    return float(mean_radps)
-
-
 @_inner
 def _refer_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
     """Count the yaw rows from their averages at the start, and keep the camera's on the turn that the IMU is on."""
@@ -697,12 +645,9 @@ def _refer_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
 
 @_inner
 def _tick(time_s: float, wheels: Array, settings: Any, feed: Any, row: Any) -> None:
-    """Write the row of a tick; ``wheels`` are the rates (3,) of the motors, or the speeds (2,) of the sides."""
+    """Write the row of a tick; ``wheels`` are the rates (3,) of the motors."""
     row[:] = np.nan
-    if settings.is_steered:
-        _take_wheels(wheels, settings, feed, row)
-    else:
-        row[SIDE], row[SIDE + 1] = wheels[0], wheels[1]
+    _take_wheels(wheels, settings, feed, row)
     for k in range(TILT):
         row[FIRST_SIGNAL + k] = _at_tick(time_s, feed.lines[k], settings.limits[k])
     for i in range(3):
@@ -715,13 +660,7 @@ def _tick(time_s: float, wheels: Array, settings: Any, feed: Any, row: Any) -> N
             row[_VARIANCE + i] = feed.gnss_variance
         if not math.isnan(row[_POSITION + 2 + i]):
             row[_VARIANCE + 2 + i] = GNSS_SPEED_STD_MPS**2
-    if not settings.is_steered and not math.isnan(row[_GYRO]) and feed.gyro_time_s > 0.0:
-        row[_GYRO] = feed.gyro_angle_rad / feed.gyro_time_s
-    feed.gyro_angle_rad = feed.gyro_time_s = 0.0
     _derive(time_s, settings, feed, row)
-    if not settings.is_steered:
-        row[REST_GYRO] = rest_at(time_s, row[SIDE], row[SIDE + 1], row[_GYRO], feed)
-        return
     if settings.ema_alpha > 0.0:  # (7.8)
         for i in range(feed.smooth.size):
             value = row[_SEEN + i]
@@ -830,7 +769,7 @@ def measurement_table(
     ----------
     run : with the stream ``wheels``; ``steering``, ``imu``, ``odometry`` and ``gnss`` are optional, whole or
         in parts, and give NaN where they are missing
-    robot : a swerve robot needs its motors, steering and sensors described, and its camera with odometry
+    robot : a swerve robot with motors, steering and sensors described, and its camera with odometry
     ema_alpha : for the thesis' own smoothing in place of the low-pass, which is what each sensor lacks to the encoders'
         ``encoder_time_constant_s`` ((6.12) and (7.8) with a time constant for their alpha):
         ``z = a z_prev + (1 - a) z_raw`` a tick on the camera's rows (7.8), at 0.2 a delay of a quarter of a tick; the
@@ -856,8 +795,11 @@ def measurement_table(
 
     A simulated camera or IMU without noise looks frozen where nothing changes: give it noise.
     """
-    if robot.steered:
-        robot.require("motors", "steering", "sensors", *(["camera"] if "odometry" in run.streams else []))
+    if robot.drive != "swerve":
+        raise ConfigError(
+            f"robot {robot.name} has the drive {robot.drive!r}: these are rows of swerve robots"
+        )
+    robot.require("motors", "steering", "sensors", *(["camera"] if "odometry" in run.streams else []))
     streams, dropped = clean_streams(run, robot)
     clock, wheels = np.array(streams["wheels"].time_s), np.array(streams["wheels"].values)
     period_s, stamps, samples, are_whole = {"wheels": median_step_s(clock)}, [], [], []
@@ -882,9 +824,8 @@ def measurement_table(
     run_feed(clock, wheels, *came, settings, feed, rows)
     dropped["wheels: beyond the motors"] = int(feed["wheels_beyond"][0])
     dropped += counts_of(feed, streams)
-    names = ROWS_OF_DRIVE[robot.drive]
-    z = rows[:, list(map(ROWS.index, names))]
-    return MeasurementTable(clock, names, z, rows[:, len(ROWS) :].copy(), dict(+dropped))
+    z = rows[:, : len(ROWS)].copy()
+    return MeasurementTable(clock, ROWS, z, rows[:, len(ROWS) :].copy(), dict(+dropped))
 
 
 def counts_of(feed: Array, streams: Iterable[str]) -> Counter[str]:

@@ -608,13 +608,14 @@ class Filter:
 
     Examples
     --------
-    >>> from terrain.estimation.models.skid import make_skid_filter
+    >>> from terrain.estimation.models.swerve import make_filter
     >>> from terrain.robots import load_robot
-    >>> filter = Filter(make_skid_filter(load_robot("husky")))
-    >>> filter.step(0.0, np.array([0.4, 0.4, 0.0, np.nan])), filter.step(0.0, np.full(4, np.nan))
+    >>> filter = Filter(make_filter("encoder12", load_robot("agrimaro")))
+    >>> wheels = np.array([8.0, 8.0, 8.0, *np.full(len(filter.model.rows) - 3, np.nan)])
+    >>> filter.step(0.0, wheels), filter.step(0.0, np.full(len(filter.model.rows), np.nan))
     (True, False)
-    >>> dict(zip(filter.model.states, filter.mean.round(2), strict=True))["speed_mps"]
-    np.float64(0.4)
+    >>> filter.model.rows[0], round(float(filter.mean[filter.model.states.index("speed_x_mps")]), 2)
+    ('wheel_1_radps', 0.4)
     """
 
     def __init__(self, model: FilterModel, settings: FilterSettings = DEFAULT_SETTINGS) -> None:

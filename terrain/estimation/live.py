@@ -33,7 +33,6 @@ from terrain.estimation import feed
 from terrain.estimation.clocks import NEVER, REWIND_S, SampleQueue, check_channels, readable
 from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, Filter, FilterSettings
 from terrain.estimation.health import HealthMonitor
-from terrain.estimation.models import skid
 from terrain.estimation.models.choice import OBSERVERS, make_observer, suitable_filter
 from terrain.estimation.models.observer import Observer, ObserverFeed, ObserverStatus
 from terrain.estimation.models.swerve import make_filter, scheduled
@@ -73,7 +72,7 @@ class LiveEstimate(NamedTuple):
     reference_age_s: float  #: time since it was; infinite before the first time
     #: (32,) what was measured, in the order of :data:`~terrain.estimation.feed.ROWS`; (0,) of an observer
     rows: Array
-    speed_x_mps: float  #: of the states, by name; of a robot that skids the speed is that of its wheels
+    speed_x_mps: float  #: of the states, by name
     speed_y_mps: float
     yaw_rate_radps: float
     accel_x_mps2: float
@@ -84,9 +83,6 @@ class LiveEstimate(NamedTuple):
     #: (13,) of the sensors of a swerve robot, as :class:`~terrain.estimation.health.Health`, in the order of
     #: :data:`~terrain.estimation.health.SENSORS`; of others (0,)
     health: Array
-    #: what is known of the motion of a robot that skids; UNKNOWN of others
-    motion: skid.Motion = skid.Motion.UNKNOWN
-    stuck_since_s: float = math.nan  #: when the robot became stuck; NaN where it is not
     slip: Array = np.empty(0)  #: of an observer, in the order of its slips, which may be angles
     status: ObserverStatus = ObserverStatus.OK  #: of the estimates of an observer
     reason: str = ""  #: why slip is not known, in a sentence; empty where it is
@@ -336,9 +332,8 @@ class LiveFilter(Live):
 
     Parameters
     ----------
-    robot : a swerve robot with motors, steering and sensors, and a camera for vio12 and vio15, or one that
-        skids; corrected
-    filter_name : one of :data:`~terrain.estimation.estimate.FILTERS` that is the robot's
+    robot : a swerve robot with motors, steering and sensors, and a camera for vio12 and vio15; corrected
+    filter_name : one of :data:`~terrain.estimation.estimate.FILTERS`
     channels : names of the columns of the streams that are read, in their order; those of the schema
     initial_yaw_rad : heading of the start in the world; without it the GNSS is not used
     rate_hz : of ``wheels`` and ``imu``, where they are not those of the robot's description
@@ -357,10 +352,6 @@ class LiveFilter(Live):
     >>> _ = estimator.step({"wheels": wheels})
     >>> estimator.latest.wheel_speed_mps, estimator.latest.slip_stale
     (array([0.4, 0.4, 0.4]), True)
-    >>> skids = LiveFilter(load_robot("husky"), "skid")
-    >>> _ = skids.step({"wheels": Reading(np.array([0.0]), np.array([[0.4, 0.4]]))})
-    >>> round(skids.latest.speed_x_mps, 2), skids.latest.motion.name
-    (0.4, 'UNKNOWN')
     """
 
     _ticks_without_wheels = True
@@ -384,15 +375,10 @@ class LiveFilter(Live):
         for stream, rate in (rate_hz or {}).items():
             if not 0.0 < rate < math.inf:
                 raise ConfigError(f"rate of {stream!r} is {rate} Hz, a number above zero is required")
-        self._robot, self._skids = robot, filter_name == "skid"
-        if channels is None:
-            channels = {**CHANNELS, "wheels": robot.rate_channels} if self._skids else CHANNELS
-        has_gnss = not self._skids and initial_yaw_rad is not None and "gnss" in channels
-        if self._skids:
-            self.model = skid.make_skid_filter(robot)
-        else:
-            self.model = make_filter(filter_name, robot, with_gnss=has_gnss)
-            robot.require("motors", "steering", "sensors")
+        self._robot, channels = robot, CHANNELS if channels is None else channels
+        has_gnss = initial_yaw_rad is not None and "gnss" in channels
+        self.model = make_filter(filter_name, robot, with_gnss=has_gnss)
+        robot.require("motors", "steering", "sensors")
         self.name, self.states, self.filter = self.model.name, self.model.states, Filter(self.model, SETTINGS)
         sensors, camera = robot.completed.sensors, robot.completed.camera
         rates = {
@@ -404,22 +390,17 @@ class LiveFilter(Live):
         period_s = {stream: 1.0 / rate for stream, rate in rates.items() if rate > 0.0}
         self._settings = feed.feed_settings(robot, period_s, yaw_rad, is_causal=True, is_live=True)
         self._feed, self._rows = feed.new_feed(), np.full((1, feed.N_NUMBERS), np.nan)
-        self._monitor = None if self._skids else HealthMonitor(robot, self.model)
+        self._monitor = HealthMonitor(robot, self.model)
         self._slip, self._region = WheelSlip(robot, self.states), RegionMonitor(robot)
-        self._motion = skid.motion_memory()
-        memories = [self.filter.state, self._feed, self._motion]
-        memories += [] if self._monitor is None else [self._monitor.memory]
+        memories = [self.filter.state, self._feed, self._monitor.memory]
         self._memories = [memory.view(np.uint8) for memory in memories]  # bytes are copied at once
         self._row_places = [feed.ROWS.index(row) for row in self.model.rows]
-        motion = ("speed_mps", "", "yaw_rate_radps", "", "") if self._skids else _MOTION
-        self._motion_places = feed.places_among(motion, self.states).tolist()
+        self._motion_places = feed.places_among(_MOTION, self.states).tolist()
         check_channels("wheels", robot.rate_channels, channels.get("wheels", ()))
-        if self._skids and channels.get("imu"):
-            check_channels("imu", ("gyro_z_radps",), channels["imu"])
         has = {"gnss": has_gnss, "odometry": robot.describes("camera")}
         queues = {
             name: SampleQueue(feed.places_among(feed.STREAMS[name], channels[name]))
-            for name in (("imu",) if self._skids else feed.STREAMS)
+            for name in feed.STREAMS
             if channels.get(name) and has.get(name, True)
         }
         self._rate_columns = feed.places_among(robot.rate_channels, channels["wheels"])
@@ -438,8 +419,8 @@ class LiveFilter(Live):
 
     @property
     def health(self) -> dict[str, str]:
-        """Health of each sensor at the last tick, by name; empty where none is judged."""
-        return {} if self._monitor is None else self._monitor.names
+        """Health of each sensor at the last tick, by name."""
+        return self._monitor.names
 
     def at(self, now_s: float) -> LiveEstimate | None:
         """Return the last estimate, its means predicted to a later time; None before the first tick."""
@@ -494,26 +475,14 @@ class LiveFilter(Live):
         rates, wheels = self._measure(tick), self._no_wheels if tick.wheels is None else tick.wheels
         now = scheduled(self.model, self._rows[:, : len(feed.ROWS)], self._rows[:, len(feed.ROWS) :])
         filter_.step(time_s, row[self._row_places], *(None if part is None else part[0] for part in now))
-        if self._monitor is not None:
-            self._monitor.judge(time_s, wheels, rates, self._rows, self._feed, filter_.state)
+        self._monitor.judge(time_s, wheels, rates, self._rows, self._feed, filter_.state)
         mean, std = filter_.mean.copy(), np.sqrt(filter_.cov.diagonal())
-        motion, age_s = skid.Motion.UNKNOWN, filter_.reference_age_s
-        slip_ratio = slip_std = motor_radps = np.full(len(robot.wheels), np.nan)
-        wheel_speed_mps = rates
-        if self._skids:  # nothing sees the ground go by: slip is not known
-            mean = skid.within_bounds(mean, robot.track_m)
-            left_mps, right_mps = row[feed.SIDE : feed.SIDE + 2].tolist()
-            has_gyro = not math.isnan(row[feed.ROWS.index("gyro_z_radps")])
-            yaw_rate, bias = (self.states.index(name) for name in ("yaw_rate_radps", "gyro_bias_radps"))
-            known = float(mean[yaw_rate]), float(std[bias]), robot.track_m
-            motion = skid.motion_at(time_s, left_mps, right_mps, has_gyro, *known, self._motion)
-        else:
-            motor_radps = rates
-            wheel_speed_mps = robot.wheel_speeds_mps(rates / robot.reduction_ratio)
-            speeds, ages_s = robot.wheel_speeds_mps(self._rows[:, : len(robot.wheels)]), np.array([age_s])
-            unmeasured_s = time_s - self._feed["received_s"].min(axis=1)
-            slips = self._slip(mean[None], filter_.cov[None], speeds, ages_s, unmeasured_s)
-            slip_ratio, slip_std = (part[0] for part in slips)
+        age_s = filter_.reference_age_s
+        wheel_speed_mps = robot.wheel_speeds_mps(rates / robot.reduction_ratio)
+        speeds, ages_s = robot.wheel_speeds_mps(self._rows[:, : len(robot.wheels)]), np.array([age_s])
+        unmeasured_s = time_s - self._feed["received_s"].min(axis=1)
+        slips = self._slip(mean[None], filter_.cov[None], speeds, ages_s, unmeasured_s)
+        slip_ratio, slip_std = (part[0] for part in slips)
         v_x, v_y, turn, a_x, a_y = self._motion_of(mean)
         if self._region.compares:
             self._region.step(time_s, float(wheel_speed_mps.mean()), turn)
@@ -531,12 +500,10 @@ class LiveFilter(Live):
             turn,
             a_x,
             a_y,
-            motor_radps,
+            rates,
             np.append(wheels, np.nan)[self._current_columns],
             wheel_speed_mps,
-            np.empty(0, np.int8) if self._monitor is None else self._monitor.health.copy(),
-            motion,
-            float(self._motion["stuck_since_s"][0]),
+            self._monitor.health.copy(),
             reason=self._reason(slip_ratio, age_s),
         )
 
@@ -544,8 +511,6 @@ class LiveFilter(Live):
         """Return why no slip is known, in a sentence; empty where one is."""
         if np.isfinite(slip_ratio).any():
             return ""
-        if self._skids:
-            return f"the filter {self.name} takes no speed over ground"
         if age_s == math.inf:
             return "no speed over ground has come yet"
         return (
@@ -644,10 +609,9 @@ Estimator = LiveFilter | LiveObserver
 #: none is named.
 LIVE_FILTERS: Mapping[str, tuple[str, ...]] = {
     "swerve": ("vio15", "vio12", "encoder12", "slip"),
-    "skid_steer": ("skid", "slip"),
-    "tracked": ("skid", "slip", "tracked", "slip-learning", "gyrodometry", "encoder-odometry"),
+    "tracked": ("slip", "tracked", "slip-learning", "gyrodometry", "encoder-odometry"),
     "bicycle": ("sideslip-multi", "sideslip-dynamic", "sideslip-kinematic", "slip"),
-    **dict.fromkeys(("tricycle", "omni", "mecanum"), ("slip",)),
+    **dict.fromkeys(("skid_steer", "tricycle", "omni", "mecanum"), ("slip",)),
 }
 
 
@@ -666,7 +630,7 @@ def make_live_filter(
     """
     if name in OBSERVERS:
         return LiveObserver(make_observer(name, robot), robot, channels, correction)
-    return LiveFilter(robot, name, channels, rate_hz=rate_hz if name == "skid" else {}, correction=correction)
+    return LiveFilter(robot, name, channels, correction=correction)
 
 
 def live_estimator(
@@ -682,14 +646,13 @@ def estimated_channels(name: str, robot: Robot) -> dict[str, tuple[str, ...]]:
     Examples
     --------
     >>> from terrain.robots import load_robot
-    >>> estimated_channels("skid", load_robot("husky"))
-    {'estimator': ('yaw_rate_radps',), 'slip': ('slip_left_ratio', 'slip_right_ratio')}
+    >>> estimated_channels("vio12", load_robot("agrimaro"))["slip"]
+    ('slip_1_ratio', 'slip_2_ratio', 'slip_3_ratio')
     """
     if name in OBSERVERS:
         observer = make_observer(name, robot)
         return {"estimator": observer.states, "slip": observer.slips}
-    motion = ("yaw_rate_radps",) if name == "skid" else ESTIMATOR_CHANNELS
-    return {"estimator": motion, "slip": tuple(f"slip_{wheel}_ratio" for wheel in robot.wheels)}
+    return {"estimator": ESTIMATOR_CHANNELS, "slip": tuple(f"slip_{wheel}_ratio" for wheel in robot.wheels)}
 
 
 def estimated_values(stream: str, estimate: LiveEstimate) -> Array:
@@ -698,5 +661,4 @@ def estimated_values(stream: str, estimate: LiveEstimate) -> Array:
         return estimate.slip if stream == "slip" else estimate.mean
     if stream == "slip":
         return estimate.slip_ratio
-    motion = [getattr(estimate, channel) for channel in ESTIMATOR_CHANNELS]
-    return np.array(motion if math.isfinite(estimate.speed_y_mps) else [estimate.yaw_rate_radps])
+    return np.array([getattr(estimate, channel) for channel in ESTIMATOR_CHANNELS])

@@ -37,8 +37,8 @@ class WheelSlip:
     Parameters
     ----------
     robot : places and radius of the wheels
-    states : of any filter: ``speed_x_mps`` (or ``speed_mps``) and ``yaw_rate_radps``, and ``speed_y_mps`` and
-        ``steer_<i>_rad`` where the robot can have them; ``DataError`` where one is missing
+    states : of any filter of a swerve robot: ``speed_x_mps``, ``speed_y_mps``, ``yaw_rate_radps`` and
+        ``steer_<i>_rad``; ``DataError`` where one is missing
     blind : whether the slip is that by the encoders and the filter's speed, whether or not it ever measured that over
         ground.  Without such a sensor a filter takes the wheels' speed for the robot's, and the figure is close to 0 on
         any ground (thesis 4.6)
@@ -56,11 +56,10 @@ class WheelSlip:
     """
 
     def __init__(self, robot: Robot, states: tuple[str, ...], blind: bool = False) -> None:
-        speed = "speed_mps" if "speed_mps" in states else "speed_x_mps"
-        for name in (speed, "yaw_rate_radps", *["speed_y_mps"] * robot.steered, *robot.steer_rows):
+        names = ["speed_x_mps", "speed_y_mps", "yaw_rate_radps", *robot.steer_rows]
+        for name in names:
             if name not in states:
                 raise DataError(f"the track has no state {name!r}, only {', '.join(states)}")
-        names = [speed, "speed_y_mps", "yaw_rate_radps", *map("steer_{}_rad".format, robot.wheels)]
         slips = list(map("slip_speed_{}_mps".format, robot.wheels))
         self._oldest_s = math.inf if blind else (LONGEST_S if slips[0] in states else STALE_AFTER_S)
         names += [""] * len(slips) if blind else slips
@@ -100,10 +99,9 @@ def wheel_slip(track: StateTrack, table: MeasurementTable, robot: Robot, blind: 
         raise DataError("the track and the measurements are not on one clock: filter this table")
     time_s = table.time_s[:, None]
     unmeasured_s = np.zeros((len(time_s), len(robot.wheels)))
-    for rows in (robot.wheel_rows, robot.steer_rows):  # of a robot that steers
-        if rows:
-            measured_s = np.where(np.isfinite(table.columns(rows)), time_s, -np.inf)
-            unmeasured_s = np.maximum(unmeasured_s, time_s - np.maximum.accumulate(measured_s, axis=0))
+    for rows in (robot.wheel_rows, robot.steer_rows):
+        measured_s = np.where(np.isfinite(table.columns(rows)), time_s, -np.inf)
+        unmeasured_s = np.maximum(unmeasured_s, time_s - np.maximum.accumulate(measured_s, axis=0))
     speeds, age_s = robot.wheel_speeds_mps(table.columns(robot.wheel_rows)), track.reference_age_s
     slip = WheelSlip(robot, track.states, blind)(track.mean, track.cov, speeds, age_s, unmeasured_s)
     return SlipTrack(track.time_s, *slip, robot.wheels, age_s > STALE_AFTER_S)
@@ -132,10 +130,8 @@ def _slips(
         states[0], states[1], states[2] = places[0], places[1], places[2]
         states[3], states[4] = places[3 + i], places[3 + n_wheels + i]
         x, y = positions_m[i, 0], positions_m[i, 1]
-        across = state[states[1]] if states[1] >= 0 else 0.0
-        steer = state[states[3]] if states[3] >= 0 else 0.0
-        ahead, left = point_velocity(state[states[0]], across, state[states[2]], x, y)
-        cos, sin = np.cos(steer), np.sin(steer)
+        ahead, left = point_velocity(state[states[0]], state[states[1]], state[states[2]], x, y)
+        cos, sin = np.cos(state[states[3]]), np.sin(state[states[3]])
         ground, sideways = in_wheel_frame(ahead, left, cos, sin)
         in_state = states[4] >= 0
         wheel_speed = ground + state[states[4]] if in_state else wheel_speed_mps[n, i]

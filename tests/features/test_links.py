@@ -19,7 +19,7 @@ IMU = ("gyro_z_radps", "accel_z_mps2")
 #: The filter of a robot, and what the windows take of it.
 ROBOTS = {
     "agrimaro": ("vio15", {"estimator": ("speed_x_mps", "yaw_rate_radps"), "slip": ("slip_1_ratio",)}),
-    "husky": ("skid", {"estimator": ("yaw_rate_radps",)}),
+    "husky": ("slip", {"estimator": ("yaw_rate_radps",)}),
 }
 
 

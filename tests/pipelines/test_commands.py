@@ -108,9 +108,9 @@ REFUSED = {
         ("--out is p.xlsx: a name that ends in .parquet or .csv is", "--model m --out p.xlsx"),
     ],
     "estimate --data data --filter": [
-        ("filter 'vio15' is not for robot husky, whose drive is skid_steer: use skid", "vio15"),
+        ("filter 'vio15' is not for robot husky, whose drive is skid_steer: use slip", "vio15"),
         ("--tuning is for filters, not for --filter tracked", "tracked --tuning thesis"),
-        ("--slip-model is for observers, not for --filter skid", "skid --slip-model m.yaml"),
+        ("--slip-model is for observers, not for --filter vio15", "vio15 --slip-model m.yaml"),
         ("--window is for --filter pose, not for --filter vio15", "vio15 --window 0.5"),
         ("filter 'tracked' takes no slip model", "tracked --slip-model m.yaml --robot orchard_ugv"),
         ("--delay is 6: input should be less than or equal to 5", "pose --delay 6"),

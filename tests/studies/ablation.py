@@ -44,8 +44,8 @@ class Source(NamedTuple):
 
 
 SETS = {
-    "borealtc": Source({"borealtc": "husky"}, "skid"),
-    "vulpi": Source({"vulpi": "husky"}, "skid"),
+    "borealtc": Source({"borealtc": "husky"}, "slip"),
+    "vulpi": Source({"vulpi": "husky"}, "slip"),
     "drive_warthog_terrains": Source({"drive_warthog_terrains": "warthog"}, "pose"),
     "drive_recordings": Source(
         {

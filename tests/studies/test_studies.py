@@ -243,7 +243,7 @@ def test_a_signal_set_that_tells_terrains_is_worth_what_is_lost_without_it(tmp_p
 
     for run in runs:
         write_run(run, tmp_path / "drawn")
-    monkeypatch.setitem(ablation.SETS, "drawn", ablation.Source({"drawn": "husky"}, "skid"))
+    monkeypatch.setitem(ablation.SETS, "drawn", ablation.Source({"drawn": "husky"}, "slip"))
     asked = ablation.Settings(data=tmp_path, sets=("drawn",), recipes=("svm",), repeats=1, n_jobs=1)
     found = ablation.run(asked)
     assert found.units == {"drawn": "144 windows of 12 runs"}

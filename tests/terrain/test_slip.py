@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.feed import GNSS_ROWS, ROWS_OF_DRIVE, MeasurementTable, measurement_table
+from terrain.estimation.feed import GNSS_ROWS, ROWS, MeasurementTable, measurement_table
 from terrain.estimation.wheel_slip import STALE_AFTER_S, slip_figures, wheel_slip
 from terrain.kinematics.camera import odometry_stream
 from terrain.records import ABSENT, RunLog, SlipTrack, StateTrack, Stream
@@ -16,7 +16,6 @@ from terrain.signals import low_pass
 from terrain.slip import slip_angle, slip_ratio
 
 ROBOT = load_robot("agrimaro")
-HUSKY = load_robot("husky")
 MOTION = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
 STEER = tuple(f"steer_{i}_rad" for i in (1, 2, 3))
 SLIP_SPEED = tuple(f"slip_speed_{i}_mps" for i in (1, 2, 3))
@@ -32,14 +31,11 @@ def make_track(mean, states, cov=None, age_s=0.0, dt_s=0.02):
     return StateTrack(np.arange(n) * dt_s, mean, cov, states, *used, np.broadcast_to(age_s, n), 0.0)
 
 
-def make_table(track, wheel_speed_mps, robot=ROBOT):
+def make_table(track, wheel_speed_mps, rows=ROWS):
     """Return measurements of which only the wheels, and how they are steered, are known."""
-    rows = ROWS_OF_DRIVE[robot.drive]
     z = np.full((track.time_s.size, len(rows)), np.nan)
-    z[:, : len(robot.wheels)] = wheel_speed_mps
-    if robot.drive == "swerve":
-        z[:, :3] /= robot.wheel_radius_m
-        z[:, [row.startswith("steer") for row in rows]] = 0.0
+    z[:, :3] = np.array(wheel_speed_mps) / ROBOT.wheel_radius_m
+    z[:, [row.startswith("steer") for row in rows]] = 0.0
     return MeasurementTable(track.time_s, rows, z, np.full((track.time_s.size, len(GNSS_ROWS)), np.nan))
 
 
@@ -133,20 +129,6 @@ def test_slip_is_unknown_where_the_ground_was_never_seen_and_stale_where_not_lat
     assert (np.diff(slip.slip_std[2:, 0]) > 0).all()  # as the state's does
 
 
-@pytest.mark.parametrize("speed_name", ["speed_x_mps", "speed_mps"])
-def test_sides_of_a_skid_steered_robot(speed_name, monkeypatch):
-    monkeypatch.setattr(f"{wheel_slip.__module__}.wheel_speed_scatter_mps", lambda _: 0.01)
-    half = HUSKY.track_m / 2
-    track = make_track([0.9, 0.5], (speed_name, "yaw_rate_radps"), np.diag([1e-4, 4e-4]))
-    left, right = 0.9 - 0.5 * half, 0.9 + 0.5 * half
-    slip = wheel_slip(track, make_table(track, [left / 0.8, right * 0.9], HUSKY), HUSKY)
-    np.testing.assert_allclose(slip.slip_ratio, [[0.2, -0.1]])
-    assert slip.wheels == ("left", "right")
-    ground_std, wheel_speed = np.sqrt(1e-4 + half**2 * 4e-4), left / 0.8
-    std = np.hypot(ground_std / wheel_speed, 0.01 * left / wheel_speed**2)
-    np.testing.assert_allclose(slip.slip_std[0, 0], std)
-
-
 def test_tracks_and_tables_that_do_not_match_are_refused():
     track = make_track(np.zeros((3, 9)), WITH_SLIP)
     with pytest.raises(DataError, match="are not on one clock"):
@@ -154,7 +136,7 @@ def test_tracks_and_tables_that_do_not_match_are_refused():
     with pytest.raises(DataError, match="no state 'steer_2_rad', only speed_x_mps, "):
         wheel_slip(make_track(np.zeros((3, 4)), WITHOUT[:4]), make_table(track, 1.0), ROBOT)
     with pytest.raises(DataError, match="no measurement 'wheel_1_radps'"):
-        wheel_slip(make_track(np.zeros((3, 6)), WITHOUT), make_table(track, [1, 1], HUSKY), ROBOT)
+        wheel_slip(make_track(np.zeros((3, 6)), WITHOUT), make_table(track, 1.0, ROWS[1:]), ROBOT)
 
 
 # through the measurements: a start as in thesis 7.2.2

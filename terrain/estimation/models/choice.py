@@ -54,8 +54,8 @@ REFERENCES = ("gnss", "pose", "lidar", "odometry")
 def suitable_filter(robot: Robot, streams: Container[str]) -> str:
     """Return the filter or observer that makes most of what a log or a robot measures.
 
-    Of swerve robots with a camera ``vio15``; of all others ``slip`` where anything measures the motion over ground, and
-    where nothing does ``skid`` of robots that skid and ``encoder12`` of swerve robots, as slip is not observable then.
+    Of swerve robots with a camera ``vio15``, and where nothing measures the motion over ground, so that slip is not
+    observable, ``encoder12``; of all others ``slip``.
 
     Parameters
     ----------
@@ -65,16 +65,16 @@ def suitable_filter(robot: Robot, streams: Container[str]) -> str:
     Examples
     --------
     >>> from terrain.robots import load_robot
-    >>> husky = load_robot("husky")
-    >>> suitable_filter(husky, ("wheels", "imu")), suitable_filter(husky, ("wheels", "imu", "gnss"))
-    ('skid', 'slip')
+    >>> swerve = load_robot("agrimaro")
+    >>> suitable_filter(swerve, ("wheels", "imu")), suitable_filter(swerve, ("wheels", "imu", "gnss"))
+    ('encoder12', 'slip')
     """
     if robot.drive == "swerve" and "odometry" in streams and robot.describes("camera"):
         name = "vio15"
-    elif any(stream in streams for stream in REFERENCES):
-        name = "slip"
+    elif robot.drive == "swerve" and not any(stream in streams for stream in REFERENCES):
+        name = "encoder12"
     else:
-        name = {"swerve": "encoder12"}.get(robot.drive, "skid" if robot.skids else "slip")
+        name = "slip"
     return robot.filters[0] if robot.filters and name not in robot.filters else name
 
 

@@ -117,6 +117,8 @@ class ObserverStatus(StatusCode):
     """The robot turns though its tracks stand."""
     BAD_INPUT = 8
     """Speeds or time are not numbers that can be; estimates are as they were."""
+    STUCK = 9
+    """The wheels turn the robot on the spot, and it does not turn."""
 
 
 class ObserverOutput(NamedTuple):

@@ -62,6 +62,7 @@ from terrain.estimation.filter import (
     differentiate,
 )
 from terrain.estimation.models.observer import FLOAT_STD_M, FilterObserver, ObserverOutput, ObserverStatus
+from terrain.estimation.stuck import Turns, next_turns
 from terrain.estimation.wheel_slip import wheel_speed_scatter_mps
 from terrain.kernels import njit
 from terrain.kinematics.wheels import rolling_matrix
@@ -390,6 +391,7 @@ class SlipFilter(FilterObserver):
         self._mean_mps = np.full(len(logged), np.nan)
         self._has_delays: tuple[int, ...] = ()
         self._uphill, self._asked, self._apart_mps2 = 0.0, 0.0, 0.0
+        self._turns = Turns()
         bounds = [DELAY_BOUNDS_S, DELAY_BOUNDS_S, *[SLIP_BOUNDS] * (n_slow + turns + n_rows)]
         self._bounds = np.array(bounds)
         self._poses = np.zeros((0, 4))  # age in ticks' time, position and heading
@@ -431,6 +433,13 @@ class SlipFilter(FilterObserver):
         mean = self.filter.mean
         np.clip(mean[_GNSS_DELAY:], *self._bounds.T, out=mean[_GNSS_DELAY:])
         self._accel_is_wrong |= abs(float(mean[_ACCEL_BIAS])) > LARGEST_BIAS_MPS2
+        if self._robot.skids:
+            turn_radps = float(mean[_W]) if math.isfinite(gyro) else math.nan
+            bias_std = math.sqrt(max(float(self.filter.cov[_GYRO_BIAS, _GYRO_BIAS]), 0.0))
+            sides = float(speeds[0]), float(speeds[1])
+            self._turns = next_turns(
+                self._turns, self._time_s, sides, turn_radps, bias_std, self._robot.track_m
+            )
         output = self._output(speeds, inputs, fix)
         is_lost = self.filter.reference_age_s > LOST_S and (np.abs(output.slip) > LOST_RATIO).all()
         if is_lost:  # what it believes of the motion follows from nothing that is measured
@@ -697,7 +706,9 @@ class SlipFilter(FilterObserver):
         slip[unknown] = deviation[unknown] = math.nan
         d = len(self.states)
         status = fix
-        if age_s == math.inf:
+        if self._turns.is_stuck:
+            status = ObserverStatus.STUCK
+        elif age_s == math.inf:
             status = ObserverStatus.STARTING
         elif not np.isfinite(speeds).any():
             status = ObserverStatus.BAD_INPUT
@@ -713,6 +724,8 @@ class SlipFilter(FilterObserver):
         """Return why no slip is known, in a sentence; empty where one is."""
         if np.isfinite(slip).any():
             return ""
+        if self._turns.is_stuck:
+            return "the robot is stuck: its wheels turn against each other, and it does not turn"
         if age_s == math.inf and (self._weight > 0.0 or not np.isnan(self._first[0])):
             return (
                 f"the heading is not known yet: it follows from a motion of {LEAST_TRAVEL_M:g} m with fixes"

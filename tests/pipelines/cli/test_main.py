@@ -39,15 +39,15 @@ def test_a_run_or_model_of_a_stranger_is_one_sentence(refused, files, model_dir)
         (lambda: (folder / "run.json").write_text(DEEP), "is nested deeper than 32 levels"),
     ):
         spoil()
-        refused(sentence, "estimate", "--data", "data", "--filter", "skid")
+        refused(sentence, "estimate", "--data", "data", "--filter", "slip")
 
 
 def test_a_robot_that_the_user_gives_may_be_a_file(files, terrain):
     text = (data_folder("robots") / "husky.yaml").read_text().replace("name: husky", "name: mule")
     (files / "mule.yaml").write_text(text)
     edit_robot(files / "data" / "r", "mule")
-    code, out, _ = terrain("estimate", "--data", "data", "--filter", "skid", "--robot", "mule.yaml")
-    assert (code, "skid" in out) == (0, True)
+    code, out, _ = terrain("estimate", "--data", "data", "--filter", "slip", "--robot", "mule.yaml")
+    assert (code, "slip" in out) == (0, True)
 
 
 def test_from_simulated_logs_to_slip_on_the_command_line(terrain, place):

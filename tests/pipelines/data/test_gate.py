@@ -20,7 +20,7 @@ HUSKY = ("--robot", "husky")
 COMMANDS = {
     "convert": ("convert", "data", "--out", "out"),
     "convert --to csv": ("convert", "data", "--to", "csv", "--out", "out"),
-    "estimate": ("estimate", "--data", "data", "--filter", "skid"),
+    "estimate": ("estimate", "--data", "data", "--filter", "slip"),
     "calibrate": ("calibrate", "--data", "data", *HUSKY),
     "crossval": ("crossval", "--data", "data"),
     "train": ("train", "--data", "data", "--name", "model"),
@@ -82,7 +82,7 @@ def test_every_command_refuses_runs_of_another_robot_than_the_one_described(refu
 def test_a_run_that_was_taken_as_it_is_is_stated_and_no_longer_refused(terrain, in_g, model_dir):
     """``--repair`` is the one option, of every command; what it decided stays with the run."""
     assert terrain("convert", "data", "--out", "runs", "--repair")[0] == 0
-    code, out, _ = terrain("estimate", "--data", "runs", "--filter", "skid", "--json", "found.json")
+    code, out, _ = terrain("estimate", "--data", "runs", "--filter", "slip", "--json", "found.json")
     assert code == 0
     (stated,) = json.loads((in_g / "found.json").read_text())["doubtful"]
     assert stated == "r: implausible" + SENTENCE.partition("implausible")[2].partition(" (mend")[0]
@@ -104,7 +104,7 @@ def test_a_doubt_is_stated_on_the_screen_in_the_result_and_on_the_page(terrain, 
     imu = Stream(imu.time_s, imu.values @ turn.T, imu.channels)
     write_run(replace(tilted, streams={**tilted.streams, "imu": imu}), place / "data")
     found = ("--json", "found.json", "--report", "page.html")
-    code, out, _ = terrain("estimate", "--data", "data", "--filter", "skid", *found)
+    code, out, _ = terrain("estimate", "--data", "data", "--filter", "slip", *found)
     (doubt,) = json.loads((place / "found.json").read_text())["doubtful"]
     assert code == 0
     assert doubt.endswith("mostly along +z is expected: a tilted sensor, or a steep slope?")
@@ -142,7 +142,7 @@ def test_a_run_that_is_made_in_python_is_warned_of_and_not_refused(drive):
             ("drive", "--terrain", "grass", "--scenario", "starts"),
             ("inspect", "data"),
         ),
-        *(("convert", "data", "--out", "out"), ("estimate", "--data", "data", "--filter", "skid")),
+        *(("convert", "data", "--out", "out"), ("estimate", "--data", "data", "--filter", "slip")),
         *(("calibrate", "--data", "data"), ("explain", "--data", "data", "--out", "out")),
         *(("crossval", "--data", "data"), ("learn-slip", "--data", "data", "--out", "table.yaml")),
     ],

@@ -71,8 +71,8 @@ def test_a_skid_steer_robot_is_filtered_where_its_model_needs_the_filter(trained
     if not (DATA / "vulpi").is_dir():
         pytest.skip("TERRAIN_DATA has no vulpi")
     runs = load_runs(DATA / "vulpi")
-    model = trained([enriched(estimate_run(run, HUSKY, "skid")) for run in runs[::2]])
-    assert (model.info.filter, model.info.robots) == ("skid", ("husky",))
+    model = trained([with_estimates(observe_run(run, HUSKY, "slip")) for run in runs[::2]])
+    assert (model.info.filter, model.info.robots) == ("slip", ("husky",))
     rows = predict(runs[5:6], model, TABLE).windows
     assert len(rows) > 5
     observer = Observer(model, robot=HUSKY, channels=channels_of(runs[5]))
@@ -187,8 +187,10 @@ def test_what_does_not_fit_is_refused_at_once(mower_model, swerve_model, grass):
         Observer(mower_model, channels={"imu": ("gyro_z_radps",), "wheels": ("speed_left_mps",)})
     with pytest.raises(DataError, match="of the stream 'estimator', which is neither"):
         Observer(swerve_model, channels=measured)
-    with pytest.raises(DataError, match="filter 'skid', which robot agrimaro does not run live"):
-        Observer(swerve_model._replace(info=replace(info, filter="skid")), None, AGRIMARO, channels_of(grass))
+    with pytest.raises(DataError, match="filter 'tracked', which robot agrimaro does not run live"):
+        Observer(
+            swerve_model._replace(info=replace(info, filter="tracked")), None, AGRIMARO, channels_of(grass)
+        )
     filtered = [
         enriched(estimate_run(*given))
         for given in ((grass, AGRIMARO, "vio15"), (another, AGRIMARO, "encoder12"))

@@ -85,7 +85,7 @@ def test_a_bias_is_believed_less_with_time_and_never_less_than_without_it():
     assert bias_of(pilot) == bias_of(LivePilot(ROBOT))
 
 
-AGRIMARO, OTHER = ("agrimaro", "vio15"), ("husky", "skid")
+AGRIMARO, OTHER = ("agrimaro", "vio15"), ("husky", "vio15")
 
 
 @pytest.mark.parametrize(

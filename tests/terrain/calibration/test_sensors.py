@@ -19,7 +19,7 @@ from terrain.calibration.sensors import (
 )
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError
-from terrain.estimation.feed import ROWS_OF_DRIVE
+from terrain.estimation.feed import ROWS
 from terrain.records import RunLog, Stream
 
 
@@ -108,7 +108,7 @@ def test_the_interval_of_coloured_noise_is_wider(nominal):
 
 def test_variances_of_the_filters_rows(nominal):
     variances = measurement_variances(nominal)
-    assert set(variances) == set(ROWS_OF_DRIVE["swerve"][:14])
+    assert set(variances) == set(ROWS[:14])
     assert min(variances.values()) == 1e-5  # thesis 4.4.3
     bare = measurement_variances(nominal, floor=0.0)
     assert bare["wheel_2_radps"] == pytest.approx(0.005**2)

@@ -112,7 +112,9 @@ def test_a_wheel_without_samples_has_no_slip(straight, stream, channel):
 
 
 def test_unknown_filters_and_tunings_are_refused_in_one_sentence(straight):
-    with pytest.raises(ConfigError, match="'skid' is not for robot agrimaro"):
-        estimate_run(straight, ROBOT, "skid")
+    with pytest.raises(
+        ConfigError, match="'vio15' is not for robot agrimaro, whose drive is swerve: use vio12"
+    ):
+        estimate_run(straight, replace(ROBOT, filters=("vio12",)), "vio15")
     with pytest.raises(ConfigError, match="no tuning 'best'"):
         estimate_run(straight, ROBOT, "vio15", tuning="best")

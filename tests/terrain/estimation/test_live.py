@@ -13,13 +13,11 @@ from hypothesis import strategies as st
 
 from terrain.errors import ConfigError
 from terrain.estimation.clocks import QUEUE
-from terrain.estimation.estimate import estimate_run
 from terrain.estimation.feed import GNSS_ROWS, ROWS, measurement_table
 from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, FilterSettings, run_filter
 from terrain.estimation.live import CHANNELS, REWIND_S, LiveFilter, LiveObserver
 from terrain.estimation.models.choice import OBSERVERS, make_observer
-from terrain.estimation.models.observer import observe, rows_of
-from terrain.estimation.models.skid import Motion, stuck_intervals
+from terrain.estimation.models.observer import ObserverStatus, observe, rows_of
 from terrain.estimation.models.slip_model import SlipModel
 from terrain.estimation.models.swerve import make_filter, scheduled
 from terrain.estimation.wheel_slip import wheel_slip
@@ -103,19 +101,14 @@ def batch(run, robot=ROBOT, name="vio15", yaw=None):
         track = observe(observer, time_s, rows)
         compared = ("mean", "std", "slip", "status")
         return time_s, {what: getattr(track, what) for what in compared}, dropped
-    if name == "skid":
-        found = estimate_run(run, robot, "skid")
-        track, table = found.track, found.table
-        desired = {"speed_x_mps": track.state("speed_mps"), "motion": found.motion}
-    else:
-        table = measurement_table(run, robot, causal=True, initial_yaw_rad=yaw or 0.0)
-        model = make_filter(name, robot, yaw is not None)
-        samples = scheduled(model, table.z, table.gnss_variance)
-        track = run_filter(model, table.time_s, table.columns(model.rows), GATES, *samples)
-        table = table.at(track.time_s)
-        slip = wheel_slip(track, table, robot)
-        desired = {name: track.state(name) for name in ("speed_x_mps", "accel_y_mps2", "yaw_rate_radps")}
-        desired |= {"slip_ratio": slip.slip_ratio, "slip_std": slip.slip_std, "slip_stale": slip.stale}
+    table = measurement_table(run, robot, causal=True, initial_yaw_rad=yaw or 0.0)
+    model = make_filter(name, robot, yaw is not None)
+    samples = scheduled(model, table.z, table.gnss_variance)
+    track = run_filter(model, table.time_s, table.columns(model.rows), GATES, *samples)
+    table = table.at(track.time_s)
+    slip = wheel_slip(track, table, robot)
+    desired = {name: track.state(name) for name in ("speed_x_mps", "accel_y_mps2", "yaw_rate_radps")}
+    desired |= {"slip_ratio": slip.slip_ratio, "slip_std": slip.slip_std, "slip_stale": slip.stale}
     known = [row for row in table.rows if row not in GNSS_ROWS or yaw is not None]
     desired |= dict(zip(known, table.columns(known).T, strict=True))
     desired |= {"mean": track.mean, "reference_age_s": track.reference_age_s}
@@ -129,7 +122,7 @@ def assert_equal(run, robot=ROBOT, name="vio15", yaw=None, replay_hz=50.0):
     estimates = settled(estimator, (sample.readings for sample in replay(run, replay_hz)))
     time_s, desired, dropped = batch(run, robot, name, yaw)
     np.testing.assert_array_equal(column(estimates, "time_s"), time_s)
-    close = {"swerve": 1e-9, "skid_steer": 1e-12}.get(robot.drive, 0.0)
+    close = 1e-9 if robot.drive == "swerve" else 0.0
     rows = column(estimates, "rows") if name not in OBSERVERS else None
     for what, expected in desired.items():
         found = rows[:, ROWS.index(what)] if what in ROWS else column(estimates, what)
@@ -170,7 +163,7 @@ def test_others_live_equal_batch_whatever_comes_together():
     few = LiveFilter(ROBOT, channels={"wheels": CHANNELS["wheels"][:3]})
     few.step({"wheels": Reading(np.array([0.0]), np.ones((1, 3)))})
     assert np.isnan(few.latest.current_a).all()
-    assert_equal(skid_log("complex", "tilled_loam", 24.0), HUSKY, "skid")
+    assert_equal(skid_log("complex", "tilled_loam", 24.0), HUSKY, "slip")
     for name, replay_hz in (("slip-learning", 7.3), ("gyrodometry", 3.1)):
         assert_equal(tracked_log(), UGV, name, replay_hz=replay_hz)
 
@@ -196,13 +189,13 @@ def test_live_equals_batch_where_the_robot_is_stuck():
         still = (time_s > 7.9) & (time_s < 16.1)
         values[still, 2] = np.random.default_rng(2).normal(0, 0.01, still.sum())
 
-    estimates = assert_equal(edited(edited(skid_log(), "wheels", spins), "imu", stands), HUSKY, "skid")
-    motion, since_s = column(estimates, "motion"), column(estimates, "stuck_since_s")
-    (interval,) = stuck_intervals(column(estimates, "time_s"), motion)
-    assert 8.0 <= interval.start_s < 11.0
-    assert interval.end_s == pytest.approx(16.0, abs=0.6)
-    assert (since_s[motion == Motion.STUCK] == interval.start_s).all()
-    assert np.isnan(since_s[motion != Motion.STUCK]).all()
+    run = edited(edited(skid_log(), "wheels", spins), "imu", stands)
+    run = replace(run, streams={name: run.streams[name] for name in ("wheels", "imu")})
+    estimates = assert_equal(run, HUSKY, "slip")
+    times_s = column(estimates, "time_s")[column(estimates, "status") == ObserverStatus.STUCK]
+    assert 10.0 <= times_s[0] < 13.0
+    assert times_s[-1] == pytest.approx(16.0, abs=0.6)
+    assert "stuck" in next(each for each in estimates if each.time_s == times_s[0]).reason
 
 
 def put(at_s, value, n=30, channel=None):
@@ -254,7 +247,7 @@ SWERVE_STREAMS = ("wheels", "steering", "imu", "odometry")
     ("robot", "name", "stream", "kind"),
     [
         *((ROBOT, "vio15", stream, kind) for stream in SWERVE_STREAMS for kind in FAULTS),
-        *((HUSKY, "skid", stream, "values") for stream in ("wheels", "imu")),
+        *((HUSKY, "slip", stream, "values") for stream in ("wheels", "imu")),
         *((UGV, "tracked", stream, "values") for stream in ("wheels", "imu", "gnss", "compass")),
     ],
 )
@@ -273,7 +266,7 @@ def test_faults_cost_live_what_they_cost_the_batch_and_slip_comes_back(robot, na
         assert np.nanmean(column(estimates, "slip_ratio")[late]) == pytest.approx(0.125, abs=0.01)
 
 
-KINDS = [(ROBOT, "vio15"), (HUSKY, "skid"), (UGV, "tracked"), (UGV, "slip-learning")]
+KINDS = [(ROBOT, "vio15"), (HUSKY, "slip"), (UGV, "tracked"), (UGV, "slip-learning")]
 ANY_KIND = pytest.mark.parametrize(("robot", "name"), KINDS, ids=[name for _, name in KINDS])
 
 
@@ -354,19 +347,14 @@ def test_arbitrary_and_wrong_readings_neither_raise_nor_make_a_state_infinite(ro
 
 
 def test_what_does_not_fit_is_refused():
-    left_alone, no_gyro = (
-        {"wheels": ("speed_left_mps",)},
-        {"wheels": HUSKY.rate_channels, "imu": ("accel_x_mps2",)},
-    )
+    left_alone = {"wheels": ("speed_left_mps",)}
     for robot, name, options, message in (
         (ROBOT, "vio15", {"channels": {"wheels": ("current_1_a",)}}, "'motor_1_radps' must be among them"),
         (ROBOT, "vio15", {"initial_yaw_rad": np.nan}, "initial_yaw_rad is nan"),
         (HUSKY, "vio15", {}, "skid_steer"),
-        (ROBOT, "skid", {}, "robot agrimaro has the drive 'swerve': this filter is for 'skid_steer'"),
-        (HUSKY, "skid", {"channels": left_alone}, "'speed_right_mps' must be among them"),
-        (HUSKY, "skid", {"channels": no_gyro}, "'gyro_z_radps' must be among them"),
-        (HUSKY, "skid", {"rate_hz": {"imu": 0.0}}, "rate of 'imu' is 0.0 Hz, a number above zero is"),
-        (HUSKY, "skid", {"rate_hz": {"wheels": np.nan}}, "rate of 'wheels' is nan Hz"),
+        (HUSKY, "slip", {"channels": left_alone}, "'speed_right_mps' must be among them"),
+        (ROBOT, "vio15", {"rate_hz": {"imu": 0.0}}, "rate of 'imu' is 0.0 Hz, a number above zero is"),
+        (ROBOT, "vio15", {"rate_hz": {"wheels": np.nan}}, "rate of 'wheels' is nan Hz"),
         (UGV, "tracked", {"channels": left_alone}, "'speed_right_mps' must be among them"),
     ):
         with pytest.raises(ConfigError, match=message):

@@ -274,7 +274,7 @@ def plain_table(run, robot, causal, initial_yaw_rad):
     wheels = streams["wheels"]
     clock, rates = wheels.time_s, wheels.values / robot.motors.reduction_ratio
     rates = np.where(np.abs(rates) > feed.MAX_RATE_FACTOR * robot.motors.speed_max_radps, np.nan, rates)
-    rows = feed.ROWS_OF_DRIVE["swerve"]
+    rows = feed.ROWS
     rates = plain_wheels(clock, wheels.values, rates, robot)
     once, twice, moving = plain_moving(clock, rates * robot.wheel_radius_m)
     table, jumps = dict(zip(rows, rates.T, strict=False)), {}

@@ -1,4 +1,4 @@
-"""Rows of measurements by whole logs: ideal sensors give the motion; faults; gyro and rest of robots that skid."""
+"""Rows of measurements by whole logs: ideal sensors give the motion; faults."""
 
 from dataclasses import replace
 
@@ -11,13 +11,8 @@ from terrain.estimation.feed import (
     CAMERA_ROWS,
     GNSS_LATENCY_S,
     GNSS_ROWS,
-    REST_ROW,
-    REST_S,
-    ROWS_OF_DRIVE,
-    STEADY_RADPS,
+    ROWS,
     measurement_table,
-    new_feed,
-    rest_at,
 )
 from terrain.kinematics.camera import odometry_stream
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
@@ -89,7 +84,7 @@ RUN = turning_run()
 
 def test_ideal_sensors_give_the_motion():
     table = measurement_table(RUN, bare())
-    assert table.rows == ROWS_OF_DRIVE["swerve"]
+    assert table.rows == ROWS
     assert table.dropped == {}
     np.testing.assert_array_equal(table.time_s, RUN.streams["wheels"].time_s)
     t = table.time_s
@@ -196,88 +191,12 @@ def test_logs_without_a_clock_are_refused():
         measurement_table(replace(RUN, streams={"imu": RUN.streams["imu"]}), ROBOT)
     with pytest.raises(DataError, match="the stream 'wheels', which gives the clock, is empty"):
         measurement_table(empty, ROBOT)
-    with pytest.raises(DataError, match="no channel 'speed_left_mps', which the robot husky should have"):
+    few = RUN.streams["wheels"]
+    few = replace(RUN, streams={"wheels": replace(few, values=few.values[:, 1:], channels=few.channels[1:])})
+    with pytest.raises(DataError, match=f"no channel {RUN.streams['wheels'].channels[0]!r}, which the robot"):
+        measurement_table(few, ROBOT)
+    with pytest.raises(ConfigError, match="'skid_steer': these are rows of swerve robots"):
         measurement_table(RUN, HUSKY)
     for alpha in (-0.1, 1.0, np.nan):
         with pytest.raises(ConfigError, match=f"ema_alpha is {alpha:g}, a number from 0 to below 1"):
             measurement_table(RUN, ROBOT, ema_alpha=alpha)
-
-
-# -- robots that skid: the gyro's mean between ticks, and what only looks like rest ---------------------------------
-
-GYRO_S, WHEELS_S = np.arange(0.0, 40.0, 0.01), np.arange(0.0, 39.9, 2 / 13)
-STILL = np.random.default_rng(7).normal(0.0, 0.002, GYRO_S.size)
-
-
-def skid_run(gyro_radps, speed_mps=0.0, gnss=None):
-    """Return a run by a gyro about z, and speeds of the wheels: one, or those of both sides (2, n)."""
-    wheels = np.broadcast_to(speed_mps, (2, WHEELS_S.size)).T
-    axes = np.column_stack([STILL, -STILL, gyro_radps])
-    streams = {
-        "wheels": Stream(WHEELS_S, wheels, ("speed_left_mps", "speed_right_mps")),
-        "imu": Stream(GYRO_S, axes, [f"gyro_{axis}_radps" for axis in "xyz"]),
-    }
-    return RunLog("drive", "husky", streams | ({} if gnss is None else {"gnss": gnss}))
-
-
-def rows_of(run):
-    table = measurement_table(run, HUSKY)
-    return table.time_s, *table.columns(["gyro_z_radps", REST_ROW]).T
-
-
-def test_a_skid_steered_robot_has_sides_and_a_gyro():
-    run = skid_run(0.3 + STILL, np.array([WHEELS_S, 2 * WHEELS_S]))
-    table = measurement_table(run, HUSKY)
-    assert table.rows == ("wheel_left_mps", "wheel_right_mps", "gyro_z_radps", *GNSS_ROWS, REST_ROW)
-    np.testing.assert_allclose(table.z[:, :2], np.column_stack([table.time_s, 2 * table.time_s]))
-    np.testing.assert_allclose(table.z[:, 2], 0.3, atol=6 * 0.002)
-    assert np.isnan(table.z[:, 3:]).all()
-    fixes = Stream(
-        WHEELS_S[::2] + GNSS_LATENCY_S, np.column_stack([WHEELS_S] * 2)[::2], ("position_x_m", "position_y_m")
-    )
-    table = measurement_table(skid_run(STILL, 1.0, fixes), HUSKY)
-    np.testing.assert_allclose(table.z[::2, 3], table.time_s[::2])
-    assert np.isnan(table.z[:, 5:]).all()  # no speed in this stream
-    np.testing.assert_allclose(table.gnss_variance[::2, 0], 0.25)  # no fix was reported
-
-
-def test_the_gyro_row_is_the_mean_since_the_last_tick():
-    gyro = np.sin(GYRO_S) + 0.2 * np.cos(2 * np.pi * 6.5 * GYRO_S) + STILL
-    time_s, mean, _ = rows_of(skid_run(gyro, 0.5))
-    angle = np.append(0.0, np.cumsum(0.5 * (gyro[1:] + gyro[:-1]) * np.diff(GYRO_S)))
-    last = np.searchsorted(GYRO_S, time_s + 1e-9) - 1
-    plain = np.diff(angle[last]) / np.diff(GYRO_S[last])
-    np.testing.assert_allclose(mean[1:], plain, atol=1e-12)
-    heading = np.sum(mean[1:] * np.diff(GYRO_S[last]))
-    assert heading == pytest.approx(angle[last[-1]], abs=1e-9)
-    sampled = np.sum(gyro[last][1:] * np.diff(time_s))  # what one sample a tick would make of it
-    assert abs(sampled - heading) > 1.0
-
-
-def test_rest_gives_the_mean_of_each_second_and_a_turn_that_begins_in_one_is_no_part_of_it():
-    _, _, rest = rows_of(skid_run(0.03 + STILL))
-    known = rest[np.isfinite(rest)]
-    assert known.size == pytest.approx(WHEELS_S[-1] / REST_S, rel=0.1)
-    np.testing.assert_allclose(known, 0.03, atol=6 * 0.002 / np.sqrt(90))
-    time_s, _, rest = rows_of(skid_run(STILL + 0.5 * np.clip(GYRO_S - 10.0, 0.0, 1.0)))
-    assert np.nanmax(np.abs(rest)) < 0.002
-    assert np.isnan(rest[(time_s > 10.3) & (time_s < 30.0)]).all()
-    feed = new_feed()[0]  # a clock that is set back starts anew
-    rows = [rest_at(at_s, 0.0, 0.0, 0.01, feed) for at_s in (5.0, 5.5, 2.0, 2.5, 3.0)]
-    np.testing.assert_array_equal(rows, [np.nan] * 4 + [0.01])
-
-
-@pytest.mark.parametrize(
-    ("gyro_radps", "speed_mps"),
-    [
-        (STILL, 0.05),
-        (STILL, -0.05),
-        (STILL, np.nan),
-        (0.5 + STILL, 0.0),
-        (STILL + 2 * STEADY_RADPS * np.sign(np.sin(3 * GYRO_S)), 0.0),
-        (np.where(np.arange(GYRO_S.size) % 90 < 60, np.nan, STILL), 0.0),
-    ],
-    ids=["forward", "backward", "no wheels", "towed in a turn", "shaken", "no gyro"],
-)
-def test_what_is_no_rest_gives_nothing(gyro_radps, speed_mps):
-    assert np.isnan(rows_of(skid_run(gyro_radps, speed_mps))[2]).all()

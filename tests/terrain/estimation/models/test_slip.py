@@ -222,6 +222,20 @@ def test_the_bias_of_a_gyro_is_that_at_rest_and_wheels_that_spin_leave_it_alone(
     assert (np.abs(track.mean[:, yaw]) < 3.0 * track.std[:, yaw]).all()
 
 
+def test_a_turn_that_begins_late_leaves_the_bias_alone():
+    """By wheels and gyro alone: tyres and soil yield first, and the wheels turn for a while before the robot."""
+    robot = load_robot("warthog")
+    run = simulate_run(robot, "grass", "survey", 81001, duration_s=18.0)
+    track = observe_run(
+        replace(run, streams={n: run.streams[n] for n in ("wheels", "imu")}), robot, "slip"
+    ).track
+    truth, late = run.streams["truth"], track.time_s > 1.0
+    for name, true, most in (("gyro_bias_radps", "gyro_bias_z_radps", 2e-3), ("yaw_rad", "yaw_rad", 0.02)):
+        error = track.state(name) - np.interp(track.time_s, truth.time_s, truth.channel(true))
+        assert np.abs(error)[late].max() < most
+        assert (np.abs(error) < 3.0 * track.std[:, track.states.index(name)])[late].all()
+
+
 def test_gravity_of_a_slope_is_taken_off_by_the_measured_pitch():
     time_s, rows, _ = drive(HUSKY)
     rows["pitch_rad"] = np.full(len(time_s), -0.1)
@@ -418,12 +432,13 @@ def test_the_scatter_of_poses_is_learned():
 
 
 def test_the_filter_that_suits_is_chosen_by_what_is_measured():
-    assert suitable_filter(HUSKY, ("wheels", "imu")) == "skid"
+    assert suitable_filter(HUSKY, ("wheels", "imu")) == "slip"
+    assert suitable_filter(SWERVE, ("wheels", "steering", "imu")) == "encoder12"
     assert suitable_filter(CAR, ("wheels", "steering", "gnss")) == "slip"
     assert suitable_filter(OMNI, ("wheels",)) == "slip"
     assert suitable_filter(SWERVE, ("wheels", "steering", "imu", "odometry")) == "vio15"
-    only = replace(HUSKY, filters=("skid",))
-    assert suitable_filter(only, ("gnss",)) == "skid"
+    only = replace(load_robot("orchard_ugv"), filters=("tracked",))
+    assert suitable_filter(only, ("gnss",)) == "tracked"
 
 
 # -- simulated robots ------------------------------------------------------------------------------------------------
