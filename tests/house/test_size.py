@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MAX_LINES = {"terrain": 57_735, "features": 2_680, "pipelines": 20_239, "tests": 51_339}
+MAX_LINES = {"terrain": 57_399, "features": 2_671, "pipelines": 20_183, "tests": 51_109}
 """Lines of Python, docstrings included."""
 
 

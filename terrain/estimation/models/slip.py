@@ -92,7 +92,7 @@ ACROSS_RATIO, ACROSS_M = 0.03, 0.05
 WHEEL_STD_MPS, REST_STD_MPS, GYRO_STD_RADPS, YAW_ACCEL = 0.01, 0.001, 0.005, 1.0
 """Of a wheel's speed, of the ground's below wheels that stand, and of a gyro's rate; walk of the yaw rate within a
 second."""
-APART_STDS = 4.0
+APART_STDS = 2.0
 """Deviation of the sides of a robot that skids, over what they differ by from the gyro: a robot that begins to turn
 follows its wheels late, and by wheels that spin the gyro's bias would run off."""
 BIAS_STD_RADPS, BIAS_WALK = 0.005, 2e-4
@@ -549,7 +549,8 @@ class SlipFilter(FilterObserver):
             rolls = 1.0 - float(self.filter.mean[_SLOW + self._wheels.n_slow])
             turn_radps = given["yaw_rate_radps"] - float(self.filter.mean[_GYRO_BIAS])
             apart_mps = 0.5 * abs((right - left) * rolls - turn_radps * self._robot.track_m)
-            std[:2] = np.hypot(std[:2], APART_STDS * np.nan_to_num(min(apart_mps, MOST_MPS)))
+            if math.isfinite(apart_mps):
+                std[:2] = np.hypot(std[:2], APART_STDS * min(apart_mps, MOST_MPS))
         late_mps = (given["gnss_age_s"] + float(self.filter.mean[_GNSS_DELAY])) * self._apart_mps2
         fix_m = given["gnss_std_m"] if given["gnss_std_m"] > 0.0 else FLOAT_STD_M
         std[MOST_ROWS:] = (
