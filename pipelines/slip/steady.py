@@ -45,7 +45,9 @@ def learn_steady(
     """
     labelled = [run for run in runs if len(run.terrains) == 1]
     if not labelled:
-        raise DataError(f"none of {len(runs)} runs has a label: target slips are learned by terrain")
+        raise DataError(
+            f"none of {len(runs)} runs has a label: target slips are learned by terrain (set by terrain label)"
+        )
     others = sorted({run.robot for run in labelled} - {robot.name})
     if others:
         raise DataError(f"runs are of the robot {others[0]!r}: a table is learned for one, {robot.name!r}")

@@ -264,6 +264,8 @@ class _Session:
         streams = {}
         for name, logged in self.values.items():
             values = logged[windows][kept]
+            if name == "lidar" and not np.isfinite(values).any():
+                continue
             sources = STREAMS.get(name, {})
             streams[name] = checked_stream(
                 f"{self.file}, {run_id}",
@@ -551,6 +553,8 @@ class _Recording:
             elif stream == "imu":
                 kept = np.asarray(~np.isnan(values).all(axis=1))
             if (stream == "commands" and name.startswith("hand")) or (stream == "pose" and kept.sum() < 2):
+                continue
+            if stream in ("lidar", "pose") and not np.isfinite(values[kept]).any():
                 continue
             streams[stream] = checked_stream(
                 f"{self.name}, {run_id}",

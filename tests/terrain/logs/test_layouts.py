@@ -17,7 +17,7 @@ from terrain.kinematics.wheels import rolling_matrix
 from terrain.logs.drive import LOST, NOT_RECORDED, STILL, STREAMS
 from terrain.logs.imu_axes import GYRO_IN_DEGREES, GYRO_TURNED, NO_SIGN, POWER_SIGN, TURNED, current_sign
 from terrain.logs.robotino import BLIND, HELD, SCALED
-from terrain.logs.run_folders import data_digest
+from terrain.logs.run_folders import data_digest, write_run
 from terrain.robots import load_robot
 
 from .held_poses import PERIOD_S, N, published_pose
@@ -516,6 +516,21 @@ def test_a_pose_that_jumps_is_unknown_and_counted_and_lost_throughout_it_is_refu
     assert np.isfinite(lidar.values[90:110]).all()
     with pytest.raises(LogError, match="lidar has lost the robot throughout"):
         load_runs(write("drive-recording", lose))
+
+
+def test_a_run_in_which_the_lidar_shows_nothing_lacks_its_streams_and_is_read_again(write, tmp_path):
+    def lose_first(columns):  # driven by hand
+        n = 200
+        for name in ("icp_pos_x", "icp_quat_z"):
+            columns[name][:n] = held(np.random.default_rng(1).uniform(-30.0, 30.0, n), 2)
+
+    runs = load_runs(write("drive-recording", lose_first))
+    for run in runs:
+        write_run(run, tmp_path / "out")
+    again = load_runs(tmp_path / "out")
+    assert [set(run.streams) for run in again] == [set(run.streams) for run in runs]
+    assert {name for run in again for name in run.streams} >= {"lidar", "pose"}
+    assert "lidar" not in again[0].streams
 
 
 def test_commands_that_move_nothing_or_are_interrupted_are_no_run_or_two(write):
