@@ -79,8 +79,8 @@ weight in traction, adds; and what turning on the spot does."""
 YIELDING_RATIO = 0.3
 """Length over the radius of a wheel that it rolls from rest until the contact pulls: tyre and soil yield first, a track
 and a gear have slack; d is then of the order of 1."""
-SLOW_RATIO, SLOW_WALK = 0.3, 0.02
-"""Of m at first, about 0: on soft ground light robots spin; and its walk within a second of driving."""
+FIRST_RATIO, SLOW_RATIO, SLOW_WALK = 0.5, 0.2, 0.02
+"""Of m at first, about 0, when it may be up to 1; that up to which it walks, and its walk in a second of driving."""
 TURN_WALK, GYRO_TURN_WALK, DIRECTION_RATIO = 0.02, 0.1, 0.1
 """Walk of chi within a second of turning, and that of a robot that skids beside a gyro, whose bias wheels that slip
 would pull; and deviation of m where the wheels begin to turn otherwise, in reverse or about a tighter turn, by a radian
@@ -365,7 +365,7 @@ class SlipFilter(FilterObserver):
                     DELAY_STD_S,
                     DELAY_STD_S,
                 ]
-                + [SLOW_RATIO] * n_slow
+                + [FIRST_RATIO] * n_slow
                 + [loss_std] * turns
                 + [FAST_RATIO] * n_rows
             ),

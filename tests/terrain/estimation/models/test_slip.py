@@ -249,7 +249,7 @@ def test_slip_of_the_ground_is_never_less_known_than_before_the_first_motion():
     speed = np.where((time_s // 2.0) % 2 == 0, 0.8, -0.8)
     rows = {"speed_left_mps": speed, "speed_right_mps": speed, "yaw_rate_radps": 0.0 * time_s}
     _, track = run_filter(HUSKY, time_s, rows)
-    assert track.std[:, track.states.index("ground_slip_left_ratio")].max() < 1.3 * module.SLOW_RATIO
+    assert track.std[:, track.states.index("ground_slip_left_ratio")].max() < 1.3 * module.FIRST_RATIO
 
 
 def test_the_covariance_is_one_where_poses_come_after_a_camera():
