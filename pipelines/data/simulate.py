@@ -19,6 +19,12 @@ if TYPE_CHECKING:
 
 EXAMPLE = "terrain simulate --robot husky --terrain grass --scenario survey --runs 8 --out runs/"
 EVERY = "all"  #: Given in place of a terrain: each soil in turn
+#: Why runs of a drive carry less of the terrain than those of tyres, of whose windows on eight soils 60 to 75 % are
+#: classified rightly: of a tracked robot 54 %, of three omni wheels 42 % on four firm floors.
+LITTLE_TERRAIN = {
+    "tracked": "Tracks bridge the roughness of the ground and hardly slip",
+    "omni": "Rollers vibrate alike on firm floors, and spin on soft ground",
+}
 STUCK_RATIO = 0.2  #: Of the distance that its wheels roll, below which a robot hardly moves
 REFERENCES = ("odometry", "gnss", "pose")  #: Streams by which a speed over ground is known
 
@@ -178,6 +184,8 @@ def limits_of(run: RunLog, robot: Robot, with_effects: bool, stuck: list[str]) -
             "With effects, the planar plant is used: it has no vibration of the ground and no load transfer, so "
             "its runs carry little of the terrain for a classifier."
         )
+    if (why := LITTLE_TERRAIN.get(robot.drive)) is not None:
+        limits.append(f"{why}: its runs carry little of the terrain for a classifier.")
     if not run.streams.keys() & set(REFERENCES):
         limits.append(
             "Nothing on board measures the speed over ground, so slip cannot be estimated: add --gnss or --pose, "

@@ -159,7 +159,8 @@ def test_what_runs_cannot_show_is_stated(tmp_path):
     assert limits("husky", "grass", "d") == ()
     (planar,) = limits("husky", "grass", "e", effect=("payload=0.3",))
     assert planar.startswith("With effects, the planar plant is used")
-    (stuck,) = limits("robotino", "dry_sand", "f")
+    little, stuck = limits("robotino", "dry_sand", "f")
+    assert little.endswith("carry little of the terrain for a classifier.")
     assert stuck.startswith("On dry_sand it hardly moves")
 
 
