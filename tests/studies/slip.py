@@ -109,7 +109,7 @@ def errors_of(run: RunLog, robot: Robot, between_s: tuple[float, float]) -> tupl
         if name not in truth.channels:  # a wheel that never turned
             continue
         wheel = name.removeprefix("slip_").removesuffix("_ratio")
-        true = np.interp(at_s, truth.time_s, truth.channel(name))
+        true = np.clip(np.interp(at_s, truth.time_s, truth.channel(name)), -1.0, 1.0)  # as slip_ratio is
         turns = np.interp(at_s, truth.time_s, truth.channel(f"wheel_{wheel}_radps")) * robot.wheel_radius_m
         chosen = (np.abs(turns) > LEAST_MPS) & (track.time_s > between_s[0]) & (track.time_s < between_s[1])
         errors.append((track.slip[:, k] - true)[chosen])
