@@ -87,13 +87,14 @@ class TractionSettings(NamedTuple):
 SETTINGS = TractionSettings()
 #: Of other than swerve robots: a satellite receiver or a camera gives a speed to 3 or 4 cm/s, which near the launch
 #: speed is 0.2 of slip, and less than half of what a start takes without control; what is not known is driven as by a
-#: ramp, slower than the usual 1 m/s^2, and that is the fastest; a robot that gains less than half of it loses more
-#: distance than slip is worth.
+#: ramp, slower than the usual 1 m/s^2, and that is the fastest; an acceleration behind a low-pass does last; a robot
+#: that gains less than half of it loses more distance than slip is worth.
 OTHERS = {
     "std_max_ratio": 0.2,
     "launch_mps": 0.2,
     "smooth_s": 0.2,
     "std_ahead": 0.25,
+    "lead_max_mps2": 0.8,
     "gain_least_mps2": 0.4,
     "fade_mps2": 0.7,
     "rise_mps2": 1.0,
