@@ -4,7 +4,7 @@ The body moves with V = (v_x, v_y, w) at its origin, heading psi.  Row i of the 
 a wheel in :math:`D_i` (:func:`terrain.kinematics.wheels.rolling_matrix`), its circumferential speed :math:`u_i` and the
 root mean square U of all of them, is
 
-.. math:: D_i V = u_i (1 - m_i) - \chi\, t_i - d_i U .
+.. math:: D_i V = u_i (1 - m_i) - \chi\, t_i - c (1 - |m_i|) |u_i| \dot u_i - d_i U .
 
 - **m**, the slip of this ground, of each side of a robot that skids and each wheel that rolls across, else of all
   wheels: a random walk while the robot moves, the same forward and backward, and through standstill.
@@ -13,10 +13,12 @@ root mean square U of all of them, is
   :math:`B / (1 - \chi)` (Mandow et al., Experimental kinematics for wheeled skid-steer mobile robots, IROS 2007).
   Robots that steer: a row across the front wheel, which does not slide, with :math:`t = u \sin \delta`, so that chi is
   what understeer takes of the curvature.
+- **c**, the slip that traction takes, by an acceleration of the wheels: of the order of 0.05 on asphalt and 0.2 on sand
+  for 1 m/s^2, as the slope of a traction curve is.
 - **d**, what slip deviates by for moments, as traction and turning change: forgotten within :data:`FAST_S`, with a
   deviation that grows with the acceleration of the wheels and how tight the turn is.
 
-So slip is linear in V, m, chi and d at every speed, singular nowhere, and a wheel that stands says that the ground
+So slip is linear in V, m, chi, c and d at every speed, singular nowhere, and a wheel that stands says that the ground
 stands below it, and nothing of its slip.  The slip ratio that comes out is that of its definition, of :math:`u_i` and
 :math:`D_i V` (:mod:`terrain.slip`).
 
@@ -26,9 +28,9 @@ walks; sideways speed of robots that cannot drive sideways returns to 0.  A gyro
 **Ages.**  A fix is of an instant before its tick.  It is not moved to it: what the filter expects of it is that of its
 own instant, by its state, so that a receiver that is late leaves no error in the speed to first order.
 
-**Scatter of poses.**  Nothing states it, and it differs by a hundred between systems: it is that of third differences
-of four poses that follow each other evenly, over the root of 20, their gain on white noise; motion adds its jerk times
-the cube of the period.
+**Scatter of poses and wheel speeds.**  Nothing states it, and it differs by a hundred between systems: it is that of
+third differences of four samples that follow each other evenly, over the root of 20, their gain on white noise; motion
+adds its jerk times the cube of the period.
 
 **Jumps.**  A pose or position that is rejected for :data:`terrain.estimation.filter.REOPEN_AFTER_S` is elsewhere: the
 position follows it, and speed and slip stay as they are, which what positions change by from there on measures.
@@ -46,7 +48,7 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -73,9 +75,15 @@ from terrain.slip import MIN_SPEED_MPS, slip_ratio
 
 FAST_S, ACROSS_S = 0.5, 5.0
 """Over which d, and sideways speed of a robot that cannot drive sideways, are forgotten."""
-FAST_RATIO, FAST_PER_MPS2, FAST_TURNING = 0.01, 0.3, 0.06
+FAST_RATIO, FAST_PER_MPS2, FAST_TURNING = 0.01, 0.12, 0.06
 """Standard deviation of d in steady straight motion; what an acceleration of the wheels of 1 m/s^2, a tenth of the
 weight in traction, adds; and what turning on the spot does."""
+STEEPER_RATIO = 0.2
+"""m at which the same acceleration takes twice the slip: traction curves flatten."""
+PULL_PER_MPS2, PULL_STD_PER_MPS2, PULL_WALK = 0.1, 0.1, 0.01
+"""Of c at first: from asphalt to sand; and its walk within a second of driving."""
+MOST_PULL_MPS2 = 3.0
+"""Acceleration of the wheels beyond which they spin or lock, whatever the ground."""
 YIELDING_RATIO = 0.3
 """Length over the radius of a wheel that it rolls from rest until the contact pulls: tyre and soil yield first, a track
 and a gear have slack; d is then of the order of 1."""
@@ -84,27 +92,31 @@ FIRST_RATIO, SLOW_RATIO, SLOW_WALK = 0.5, 0.2, 0.02
 TURN_WALK, GYRO_TURN_WALK, DIRECTION_RATIO = 0.02, 0.1, 0.1
 """Walk of chi within a second of turning, and that of a robot that skids beside a gyro, whose bias wheels that slip
 would pull; and deviation of m where the wheels begin to turn otherwise, in reverse or about a tighter turn, by a radian
-in the space of their speeds."""
+in the space of their speeds; half of m adds to it: what slips uphill may not slip back down."""
 SLOPE_RATIO2, SLOPE_S = 0.1, 1.0
 """Variance of m for a slope that changes by 1: a tenth of slope is a deviation of a tenth, as on loam; its low-pass."""
+LEAST_CHANGE = 0.03
+"""Least change of slope and of how the wheels turn, in radians: what is less is noise, which would add up."""
 ACROSS_RATIO, ACROSS_M = 0.03, 0.05
 """Sideways speed over the speed of the wheels, and over the yaw rate: of a robot that skids, and in turns."""
-WHEEL_STD_MPS, REST_STD_MPS, GYRO_STD_RADPS, YAW_ACCEL = 0.01, 0.001, 0.005, 1.0
-"""Of a wheel's speed, of the ground's below wheels that stand, and of a gyro's rate; walk of the yaw rate within a
-second."""
+WHEEL_STD_MPS, LEAST_WHEEL_STD_MPS, REST_STD_MPS, GYRO_STD_RADPS, YAW_ACCEL = 0.01, 0.006, 0.001, 0.005, 1.0
+"""Of a wheel's speed at first and at least, of the ground's below wheels that stand, and of a gyro's rate; walk of the
+yaw rate within a second."""
 APART_STDS = 2.0
 """Deviation of the sides of a robot that skids, over what they differ by from the gyro: a robot that begins to turn
 follows its wheels late, and by wheels that spin the gyro's bias would run off."""
 BIAS_STD_RADPS, BIAS_WALK = 0.005, 2e-4
-ACCEL_WALK, SHAKEN_RATIO, FREE_WALK = 0.05, 0.2, 1.0
-"""Walk of the speed within a second beside an accelerometer, what 1 m/s^2 of vibration adds, and without one."""
+ACCEL_WALK, FREE_WALK = 0.02, 1.0
+"""Walk of the speed within a second beside an accelerometer, to which its vibration adds as white noise, and without
+one."""
 ACCEL_BIAS_STD, TILTED_WALK, UNTILTED_WALK = 0.6, 0.1, 0.3
 """Of the accelerometer's bias at first, and its walk within a second with a measured pitch, and without one, where it
 is the slope's gravity."""
 POSE_STD_M, POSE_STD_RAD, COMPASS_STD_RAD, CAMERA_STD_MPS, GNSS_SPEED_STD_MPS = 0.02, 0.02, 0.05, 0.03, 0.03
 """Of measurements whose own deviation is not given; of poses at first."""
-LEAST_POSE_STD_M, LEAST_POSE_STD_RAD, N_POSES, POSES_FORGOTTEN = 5e-4, 5e-4, 5, 100
-"""Of the scatter of poses: the least, what the first value counts as, and how many poses are remembered."""
+LEAST_POSE_STD_M, LEAST_POSE_STD_RAD = 5e-4, 5e-4
+N_POSES, N_SPEEDS, N_REMEMBERED = 5, 100, 100
+"""Of what scatters: how many samples the first value counts as, and how many are remembered."""
 DELAY_S, DELAY_STD_S, KNOWN_STD_S = 0.07, 0.07, 0.02
 """Of fixes behind their stamps, at first: some are stamped when they are measured, some when they arrive; and deviation
 of one that a description has by logs."""
@@ -125,9 +137,9 @@ PREDICTED_S = 0.5
 """Time without a reference from which on slip is predicted."""
 UNKNOWN_RATIO = 0.25
 """Standard deviation of a slip that is not known."""
-LEAST_MPS, STANDING_MPS, VIBRATION_S, CHANGE_S, MEAN_S = 0.2, 0.01, 0.3, 0.15, 0.4
+LEAST_MPS, STANDING_MPS, VIBRATION_S, CHANGE_S, MEAN_S = 0.2, 0.01, 0.3, 0.1, 0.2
 """Least speed that shows a heading, that of wheels that stand; low-passes of vibration, of how the wheels' speeds
-change, and of what their slip is multiplied by."""
+change, and of what their slip is multiplied by, which has two in a row."""
 LEAST_SLOW = 0.01
 """Of m, below which it does not matter how far behind what it is multiplied by is."""
 N_JUDGED = 7
@@ -141,17 +153,18 @@ _MOTION = (
 )
 _X, _Y, _YAW, _VX, _VY, _W, _GYRO_BIAS, _ACCEL_BIAS, _GNSS_DELAY, _POSE_DELAY, _SLOW = range(11)
 MOST_ROWS = 6  # of a swerve robot: along and across each wheel
-# Places in `params`: counts and levers, the slow state of each row; and as inputs D, u, t, U, the acceleration, ages.
+# Places in `params`: counts and levers, the slow state of each row; and as inputs D, u, its mean, t, (1 - m) |u| du/dt,
+# U, the acceleration, ages.
 _N_ROWS, _N_SLOW, _TURNS, _FREE_ACROSS, _ANTENNA, _POSED, _SEEN, _GROUP = 0, 1, 2, 3, 4, 6, 8, 10
 _D = _GROUP + MOST_ROWS
-_U, _S, _T, _SIZE = (_D + k * MOST_ROWS for k in (3, 4, 5, 6))
+_U, _S, _T, _PULL, _SIZE = (_D + k * MOST_ROWS for k in (3, 4, 5, 6, 7))
 _ACCEL, _MEAN_ACCEL, _AGES = _SIZE + 1, _SIZE + 2, _SIZE + 3
-_SPEEDS, _SMOOTH, _TURNING = (
-    slice(a - _D, b - _D) for a, b in ((_U, _S), (_S, _T), (_T, _SIZE))
+_SPEEDS, _SMOOTH, _TURNING, _PULLING = (
+    slice(a - _D, a - _D + MOST_ROWS) for a in (_U, _S, _T, _PULL)
 )  # of the inputs
 _INPUTS = (
     *(f"d_{i}" for i in range(3 * MOST_ROWS)),
-    *(f"{name}_{i}" for name in "ust" for i in range(MOST_ROWS)),
+    *(f"{name}_{i}" for name in "ustp" for i in range(MOST_ROWS)),
     *("size", "accel", "mean_accel", "gnss_age", "pose_age", "camera_age"),
 )
 
@@ -183,7 +196,7 @@ def _move(x: Array, dt: float, params: Array, x_next: Array) -> None:
         x_next[_VY] *= math.exp(-dt / ACROSS_S)
     else:
         x_next[_VY] -= dt * x[_W] * x[_VX]
-    fast = _SLOW + int(params[_N_SLOW] + params[_TURNS])
+    fast = _SLOW + int(params[_N_SLOW] + params[_TURNS]) + 1
     for i in range(int(params[_N_ROWS])):
         x_next[fast + i] *= math.exp(-dt / FAST_S)
 
@@ -202,7 +215,8 @@ def _wheels(x: Array, params: Array, z: Array) -> None:
         z[i] = ground - params[_U + i] + params[_S + i] * x[_SLOW + int(params[_GROUP + i])]
         if turns > 0:
             z[i] += params[_T + i] * x[_SLOW + n_slow]
-        z[i] += params[_SIZE] * x[_SLOW + n_slow + turns + i]
+        z[i] += params[_PULL + i] * x[_SLOW + n_slow + turns]
+        z[i] += params[_SIZE] * x[_SLOW + n_slow + turns + 1 + i]
 
 
 @njit
@@ -284,6 +298,47 @@ def rows_of_wheels(robot: Robot) -> WheelRows:
     return WheelRows(logged, across, tuple(range(n)) if robot.skids or robot.on_omni_wheels else (0,) * n)
 
 
+class Scatter(NamedTuple):
+    """Standard deviation of the white noise of what moves smoothly, by third differences of what was measured."""
+
+    last: Array  #: (up to 4, 1 + k) time and values of the last samples
+    square: Array  #: (k,) of each value
+    n: int  #: how many samples it counts as
+
+    @classmethod
+    def of(cls, std: Sequence[float], n: int) -> Scatter:
+        """Return what is believed before any sample, and how many samples it counts as.
+
+        Examples
+        --------
+        >>> scatter, rng = Scatter.of([0.1], 20), np.random.default_rng(0)
+        >>> for k in range(500):
+        ...     scatter = scatter.after(0.1 * k, np.sin([0.1 * k]) + 0.02 * rng.standard_normal(1), 1e-3)
+        >>> scatter.std.round(2)
+        array([0.02])
+        """
+        return cls(np.zeros((0, 1 + len(std))), np.square(std), n)
+
+    @property
+    def std(self) -> Array:
+        """Standard deviation of each value (k,)."""
+        return np.sqrt(self.square)
+
+    def after(self, time_s: float, values: Array, least_std: Array | float) -> Scatter:
+        """Return what is believed after a sample; one that is missing or not even with others shows nothing."""
+        last = np.vstack([self.last[-3:], [time_s, *values]])
+        steps_s = np.diff(last[:, 0])
+        if len(steps_s) < 3 or steps_s.min() <= 0.8 * steps_s.max():
+            return self._replace(last=last)
+        squares = np.diff(last[:, 1:], 3, axis=0)[0] ** 2 / 20.0
+        squares = np.fmin(squares, 9.0 * self.square)  # a jump is no scatter
+        n = min(self.n + 1, N_REMEMBERED)
+        learnt = np.where(
+            np.isnan(last).any(axis=0)[1:], self.square, self.square + (squares - self.square) / n
+        )
+        return Scatter(last, np.maximum(learnt, np.square(least_std)), n)
+
+
 class SlipFilter(FilterObserver):
     """The slip of a robot of any drive.
 
@@ -303,7 +358,7 @@ class SlipFilter(FilterObserver):
     >>> rows[:, filter_.rows.index("gnss_std_m")] = 0.02
     >>> track = observe(filter_, time_s, rows)
     >>> track.slip[-1].round(2), track.slip_std[-1].round(2)
-    (array([0.1, 0.1]), array([0.03, 0.03]))
+    (array([0.1, 0.1]), array([0.02, 0.02]))
     """
 
     in_world = True
@@ -316,12 +371,12 @@ class SlipFilter(FilterObserver):
         turns = robot.skids or isinstance(robot, BicycleRobot)
         names = [robot.wheels[i] for i in logged.tolist()]
         slow = [f"ground_slip_{name}_ratio" for name in names] if n_slow > 1 else ["ground_slip_ratio"]
-        self.states = (*_MOTION, *slow, *["turn_loss_ratio"] * turns)
+        self.states = (*_MOTION, *slow, *["turn_loss_ratio"] * turns, "slip_per_mps2")
         self.slips = tuple(f"slip_{name}_ratio" for name in names)
         self._speeds = tuple(f"speed_{name}_mps" for name in names)
         steer = tuple(f"steer_{name}_rad" for name in robot.steered_wheels)
         self.rows = (*self._speeds, *steer, *_INERTIAL, *_REFERENCES, *_AGE_ROWS, "gnss_std_m")
-        self._scatter_mps = float(np.fmax(wheel_speed_scatter_mps(robot), WHEEL_STD_MPS))
+        scatter_mps = float(np.fmax(wheel_speed_scatter_mps(robot), WHEEL_STD_MPS))
         effective_m = robot.identified.get("effective_track_m")
         loss, loss_std = (0.4, 0.25) if robot.skids else (0.0, 0.15)
         if robot.skids and effective_m is not None:
@@ -367,10 +422,16 @@ class SlipFilter(FilterObserver):
                 ]
                 + [FIRST_RATIO] * n_slow
                 + [loss_std] * turns
+                + [PULL_STD_PER_MPS2]
                 + [FAST_RATIO] * n_rows
             ),
             initial_mean=np.array(
-                [0.0] * _GNSS_DELAY + [DELAY_S] * 2 + [0.0] * n_slow + [loss] * turns + [0.0] * n_rows
+                [0.0] * _GNSS_DELAY
+                + [DELAY_S] * 2
+                + [0.0] * n_slow
+                + [loss] * turns
+                + [PULL_PER_MPS2]
+                + [0.0] * n_rows
             ),
             inputs=_INPUTS,
             references=("pose", "gnss_position", "gnss_speed", "camera"),
@@ -389,14 +450,14 @@ class SlipFilter(FilterObserver):
         self._rolling, self._steer = rolling_matrix(*place)[logged], steer
         self._smooth_mps, self._accel_mps2, self._shaken_square = np.full(len(logged), np.nan), math.nan, 0.0
         self._pulls, self._accel_is_wrong, self._rolled_m = np.zeros(len(logged)), False, 0.0
-        self._mean_mps = np.full(len(logged), np.nan)
+        self._mean_mps = np.full((2, len(logged)), np.nan)
         self._has_delays: tuple[int, ...] = ()
         self._uphill, self._asked, self._apart_mps2 = 0.0, 0.0, 0.0
         self._turns = Turns()
-        bounds = [DELAY_BOUNDS_S, DELAY_BOUNDS_S, *[SLIP_BOUNDS] * (n_slow + turns + n_rows)]
+        bounds = [DELAY_BOUNDS_S, DELAY_BOUNDS_S, *[SLIP_BOUNDS] * (n_slow + turns + 1 + n_rows)]
         self._bounds = np.array(bounds)
-        self._poses = np.zeros((0, 4))  # age in ticks' time, position and heading
-        self._pose_square, self._n_poses = np.square([POSE_STD_M, POSE_STD_RAD]), N_POSES
+        self._speed_scatter = Scatter.of([scatter_mps] * len(logged), N_SPEEDS)
+        self._pose_scatter = Scatter.of([POSE_STD_M, POSE_STD_M, POSE_STD_RAD], N_POSES)
         self._is_placed, self._first, self._seen, self._weight = False, np.full(2, np.nan, complex), 0j, 0.0
 
     def step(self, row: Array, dt_s: float) -> ObserverOutput:
@@ -410,12 +471,14 @@ class SlipFilter(FilterObserver):
         speeds[~(np.abs(speeds) <= MOST_MPS)] = np.nan
         angles, (logged, across, _) = np.array([given[name] for name in self._steer]), self._wheels
         speeds[np.isin(logged, across[np.isnan(angles)])] = np.nan  # of a wheel that drives who knows where
-        before_mps = np.where(np.isfinite(self._mean_mps), self._mean_mps, np.nan_to_num(speeds))
+        self._speed_scatter = self._speed_scatter.after(self._time_s + dt_s, speeds, LEAST_WHEEL_STD_MPS)
+        means_mps = np.where(np.isfinite(self._mean_mps), self._mean_mps, np.nan_to_num(speeds))
         slow = np.abs(self.filter.mean[[_SLOW + group for group in self._wheels.groups[: speeds.size]]])
-        behind_mps = np.fmin(3.0 * self._scatter_mps / np.maximum(slow, LEAST_SLOW), np.abs(speeds))
-        before_mps = np.clip(before_mps, *(np.nan_to_num(speeds) + sign * behind_mps for sign in (-1.0, 1.0)))
-        gain = -math.expm1(-dt_s / MEAN_S)
-        self._mean_mps = before_mps + gain * np.nan_to_num(speeds - before_mps)
+        behind_mps = np.fmin(3.0 * self._speed_scatter.std / np.maximum(slow, LEAST_SLOW), np.abs(speeds))
+        means_mps = np.clip(means_mps, *(np.nan_to_num(speeds) + sign * behind_mps for sign in (-1.0, 1.0)))
+        gain, before_mps = -math.expm1(-dt_s / MEAN_S), means_mps[1]
+        means_mps[0] += gain * np.nan_to_num(speeds - means_mps[0])
+        self._mean_mps = np.array([means_mps[0], before_mps + gain * (means_mps[0] - before_mps)])
         rates_mps2 = self._rates(speeds, dt_s)
         inputs = self._inputs(given, speeds, rates_mps2, before_mps, angles, dt_s)
         z = np.full(MOST_ROWS, np.nan)
@@ -454,7 +517,7 @@ class SlipFilter(FilterObserver):
         return output
 
     def _rates(self, speeds: Array, dt_s: float) -> Array:
-        """Return how fast the speeds of the wheels change, behind a low-pass; 0 where that is not known."""
+        """Return how fast the speeds of the wheels change, behind a low-pass; 0 where it is not known."""
         behind = np.nan_to_num(speeds - self._smooth_mps)
         gain = -math.expm1(-dt_s / CHANGE_S)
         moved = np.where(np.isfinite(self._smooth_mps), self._smooth_mps + gain * behind, speeds)
@@ -480,7 +543,8 @@ class SlipFilter(FilterObserver):
         n, inputs, (logged, across, _) = speeds.size, np.zeros(len(_INPUTS)), self._wheels
         known, rolling, turning = np.nan_to_num(speeds), np.zeros((MOST_ROWS, 3)), np.zeros(MOST_ROWS)
         smooth_mps = np.nan_to_num(self._smooth_mps)
-        size = math.sqrt(max(float(np.mean(known**2)), float(np.mean(smooth_mps**2))))
+        sharp_mps = np.maximum(np.abs(known) - 3.0 * self._speed_scatter.std, 0.0)
+        size = math.sqrt(max(float(np.mean(sharp_mps**2)), float(np.mean(smooth_mps**2))))
         rolling[:n] = self._rolling
         if self._steer:
             directions, positions_m = (
@@ -509,7 +573,10 @@ class SlipFilter(FilterObserver):
         inputs[: 3 * MOST_ROWS], inputs[_SPEEDS][:n], inputs[_TURNING] = rolling.ravel(), known, turning
         if self._robot.skids and size > 0.0:  # turning on the spot says nothing of slip straight ahead
             before_mps = before_mps * (1.0 - min(abs(float(turning[0])) / size, 1.0) ** 2)
-        inputs[_SMOOTH][:n] = before_mps
+        groups = list(self._wheels.groups[:n])
+        sticks = np.clip(1.0 - np.abs(self.filter.mean[_SLOW:][groups]), 0.0, 1.0)  # slip ends at 1
+        pulled_mps2 = sticks * np.clip(rates_mps2, -MOST_PULL_MPS2, MOST_PULL_MPS2)
+        inputs[_SMOOTH][:n], inputs[_PULLING][:n] = before_mps, np.abs(before_mps) * pulled_mps2
         inputs[_SIZE - _D :] = size, accel, self._since_fix(rates_mps2, rolling[:n, 0]), *ages
         self.accel_mps2 = accel - float(self.filter.mean[_ACCEL_BIAS])
         return inputs
@@ -540,8 +607,9 @@ class SlipFilter(FilterObserver):
         A wheel's speed is a mean over a tick, half of one late.  A measured speed is of an age ago; what it has changed
         by since is uncertain by what wheels and accelerometer do not agree on.
         """
-        std = np.full(MOST_ROWS + 1 + len(_REFERENCES), self._scatter_mps)
-        std[: rates_mps2.size] = np.hypot(self._scatter_mps, 0.29 * dt_s * rates_mps2)
+        scatter_mps = self._speed_scatter.std
+        std = np.full(MOST_ROWS + 1 + len(_REFERENCES), scatter_mps.max())
+        std[: rates_mps2.size] = np.hypot(scatter_mps, 0.29 * dt_s * rates_mps2)
         if size_mps < STANDING_MPS:
             std[:MOST_ROWS] = REST_STD_MPS
         if self._robot.skids:
@@ -555,7 +623,7 @@ class SlipFilter(FilterObserver):
         fix_m = given["gnss_std_m"] if given["gnss_std_m"] > 0.0 else FLOAT_STD_M
         std[MOST_ROWS:] = (
             *(GYRO_STD_RADPS, fix_m, fix_m, *[math.hypot(GNSS_SPEED_STD_MPS, late_mps)] * 2),
-            *np.sqrt(self._pose_square[[0, 0, 1]]),
+            *self._pose_scatter.std,
             *(COMPASS_STD_RAD, CAMERA_STD_MPS, CAMERA_STD_MPS),
         )
         return np.where(np.isfinite(std), std, GNSS_SPEED_STD_MPS) ** 2
@@ -564,9 +632,10 @@ class SlipFilter(FilterObserver):
         """Return what the variance of each state grows by in a second, up to this tick."""
         n_rows, size = len(self._wheels.groups), float(inputs[_SIZE - _D])
         n_slow = self._wheels.n_slow
+        slow = self.filter.mean[_SLOW : _SLOW + n_slow]
         dt_s, walk = max(dt_s, 1e-6), np.zeros(len(self.filter.model.states))
         has_accel, has_pitch = math.isfinite(inputs[_ACCEL - _D]), math.isfinite(given["pitch_rad"])
-        shaken = SHAKEN_RATIO * math.sqrt(self._shaken_square)
+        shaken = math.sqrt(self._shaken_square * dt_s)
         walk[_VX] = (ACCEL_WALK + shaken if has_accel else FREE_WALK) ** 2
         turn_radps = abs(float(self.filter.mean[_W]))
         across = (ACROSS_RATIO * size + ACROSS_M * turn_radps) ** 2
@@ -581,16 +650,27 @@ class SlipFilter(FilterObserver):
             if has_pitch:  # what gravity asks of the wheels, in the direction that they turn
                 self._uphill += -math.expm1(-dt_s / SLOPE_S) * (-math.sin(given["pitch_rad"]) - self._uphill)
             asked = self._uphill * math.copysign(1.0, float(inputs[_SPEEDS].sum()))
-            changed = DIRECTION_RATIO**2 * turned + SLOPE_RATIO2 * abs(asked - self._asked)
-            known = self.filter.cov.diagonal()[_SLOW : _SLOW + n_slow] < SLOW_RATIO**2
-            walk[_SLOW : _SLOW + n_slow] = np.where(known, SLOW_WALK**2 + changed / dt_s, 0.0)
-            self._pulls, self._asked = pulls, asked
+            changed = np.zeros(n_slow)
+            if turned > LEAST_CHANGE:
+                changed, self._pulls = turned * (DIRECTION_RATIO**2 + np.square(0.5 * slow)), pulls
+            if abs(asked - self._asked) > LEAST_CHANGE:
+                changed, self._asked = changed + SLOPE_RATIO2 * abs(asked - self._asked), asked
+            unknown = (
+                np.square(np.maximum(SLOW_RATIO, np.abs(slow)))
+                - self.filter.cov.diagonal()[_SLOW : _SLOW + n_slow]
+            )
+            walk[_SLOW : _SLOW + n_slow] = np.clip(unknown / dt_s, 0.0, SLOW_WALK**2 + changed / dt_s)
             by_gyro = self._robot.skids and math.isfinite(given["yaw_rate_radps"])
             turn_walk = GYRO_TURN_WALK if by_gyro else TURN_WALK
-            walk[_SLOW + n_slow : len(self.states)] = (turn_walk * tight) ** 2
+            walk[_SLOW + n_slow : len(self.states) - 1] = (turn_walk * tight) ** 2
+            walk[len(self.states) - 1] = PULL_WALK**2
         self._rolled_m = self._rolled_m + size * dt_s if size > STANDING_MPS else 0.0
         yields = math.exp(-self._rolled_m / (YIELDING_RATIO * self._robot.wheel_radius_m))
-        fast = FAST_RATIO + FAST_PER_MPS2 * float(np.abs(rates_mps2).max()) + FAST_TURNING * tight + yields
+        shown = np.square(rates_mps2) - np.square(
+            2.0 * self._speed_scatter.std / CHANGE_S
+        )  # more than scatter
+        pulled = math.sqrt(max(float(shown.max()), 0.0)) * (1.0 + float(np.abs(slow).max()) / STEEPER_RATIO)
+        fast = FAST_RATIO + FAST_PER_MPS2 * pulled + FAST_TURNING * tight + yields
         walk[-n_rows:] = _fading(fast**2, FAST_S, dt_s)
         return walk
 
@@ -606,21 +686,13 @@ class SlipFilter(FilterObserver):
 
     def _take_pose(self, given: Mapping[str, float]) -> None:
         """Learn how much poses scatter."""
-        x, y, yaw = (given[name] for name in _REFERENCES[4:7])
-        if not math.isfinite(x + y + yaw):
-            return
-        at_s = self._time_s - (given["pose_age_s"] if math.isfinite(given["pose_age_s"]) else 0.0)
-        self._poses = np.vstack([self._poses[-3:], [at_s, x, y, yaw]])
-        steps_s = np.diff(self._poses[:, 0])
-        if len(steps_s) == 3 and steps_s.min() > 0.8 * steps_s.max():
-            jumps = np.diff(np.column_stack([self._poses[:, 1:3], np.unwrap(self._poses[:, 3])]), 3, axis=0)[
-                0
-            ]
-            squares = np.array([0.5 * float(jumps[:2] @ jumps[:2]), jumps[2] ** 2]) / 20.0
-            squares = np.minimum(squares, 9.0 * self._pose_square)  # a jump is no scatter
-            self._n_poses = min(self._n_poses + 1, POSES_FORGOTTEN)
-            learnt = self._pose_square + (squares - self._pose_square) / self._n_poses
-            self._pose_square = np.maximum(learnt, np.square([LEAST_POSE_STD_M, LEAST_POSE_STD_RAD]))
+        pose = np.array([given[name] for name in _REFERENCES[4:7]])
+        if np.isfinite(pose).all():
+            at_s = self._time_s - (given["pose_age_s"] if math.isfinite(given["pose_age_s"]) else 0.0)
+            last_rad = self._pose_scatter.last[-1, 3] if len(self._pose_scatter.last) else 0.0
+            pose[2] = last_rad + wrapped(pose[2] - last_rad)
+            least = np.array([LEAST_POSE_STD_M, LEAST_POSE_STD_M, LEAST_POSE_STD_RAD])
+            self._pose_scatter = self._pose_scatter.after(at_s, pose, least)
 
     def _place(self, given: Mapping[str, float], inputs: Array) -> Array:
         """Return the references that are used at a tick, and begin their frame where that becomes possible."""
@@ -701,7 +773,7 @@ class SlipFilter(FilterObserver):
         slower = np.fmin(np.abs(speeds), np.abs(ground[:n])) / np.fmax(fastest, MIN_SPEED_MPS)
         traction = np.abs(speeds) >= np.abs(ground[:n])
         by_ground, by_wheel = np.where(traction, 1.0, slower), np.where(traction, slower, 1.0)
-        deviation = np.hypot(by_ground * std[:n], by_wheel * self._scatter_mps) / np.fmax(
+        deviation = np.hypot(by_ground * std[:n], by_wheel * self._speed_scatter.std) / np.fmax(
             fastest, MIN_SPEED_MPS
         )
         unknown = np.isnan(slip) | (deviation > UNKNOWN_RATIO) | (age_s == math.inf)
