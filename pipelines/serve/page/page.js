@@ -10,7 +10,7 @@
   let plots = { slip: [], current: null }, series = null;
 
   const text = (id, value) => { const node = byId(id); if (node.textContent !== value) node.textContent = value; };
-  const fixed = (value, digits, unit = "") => value === null || value === undefined ? "unknown" : value.toFixed(digits) + unit;
+  const fixed = (value, digits, unit = "") => value === null || value === undefined ? "unknown" : value.toFixed(digits).replace(/^-(?=[0.]*$)/, "") + unit;
   const signed = (value, digits) => value === null || value === undefined ? "unknown" : (value < 0 ? "\u2212" : "+") + Math.abs(value).toFixed(digits);
   const degrees = (rad) => rad === null ? null : rad * 180 / Math.PI;
   const colourOf = (terrain) => {
@@ -230,6 +230,9 @@
     if (none !== byId("slip").hidden) { showSlip(!none); makePlots(); }
     text("slip-none", seen.slip_unknown ? "Slip is not known: " + seen.slip_unknown + "." : "Slip is not known yet.");
     byId("slip-none").hidden = !none && !seen.slip_unknown;
+    byId("current").parentElement.hidden = series.current.every((one) => one.every((value) => value === null));
+    // of a wheel whose speed is not logged there is no slip beside those of others
+    [...byId("slip").children].forEach((figure, i) => { figure.hidden = !none && series.slip[i].slip.every((value) => value === null); });
   }
   function axes() {
     const common = { stroke: variable("--soft"), grid: { stroke: variable("--line"), width: 1 }, ticks: { stroke: variable("--line") } };
