@@ -80,7 +80,7 @@ class _Seen:
     """What is remembered of a sensor."""
 
     __slots__ = (
-        *("apart", "came_s", "changed_s", "jumped", "jumped_s", "longest_s"),
+        *("apart", "came_s", "changed_s", "is_frozen", "jumped", "jumped_s", "longest_s"),
         *("n_after", "n_same", "period_s", "scatter", "shown", "stamp_s", "usual", "value"),
     )
 
@@ -92,6 +92,7 @@ class _Seen:
         self.scatter = self.usual = SCATTER_MPS
         self.jumped = np.zeros(1)
         self.n_same = self.n_after = 0
+        self.is_frozen = False
 
 
 class StreamHealth:
@@ -264,7 +265,10 @@ class StreamHealth:
         is_long = repeated_s >= max(REPEATED_S, LONGER * seen.longest_s) and seen.n_same >= N_REPEATED
         # a wheel may stand; one that may not is seen not to follow its command
         may_repeat = sensor.stream == "steering" or (sensor.stream == "wheels" and not seen.value.any())
-        if moves and is_long and not may_repeat:
+        seen.is_frozen = (
+            is_long and not may_repeat and (moves or seen.is_frozen)
+        )  # at rest, too, until it changes
+        if seen.is_frozen:
             return Health.FROZEN
         if seen.jumped.any() and seen.n_after >= N_JUMPED - 1:
             return Health.STEPPED
