@@ -248,12 +248,8 @@ def test_slip_of_the_ground_is_never_less_known_than_before_the_first_motion_or_
     speed = np.where((time_s // 2.0) % 2 == 0, 0.8, -0.8)
     rows = {"speed_left_mps": speed, "speed_right_mps": speed, "yaw_rate_radps": 0.0 * time_s}
     _, track = run_filter(HUSKY, time_s, rows)
-<<<<<<< HEAD
-    assert track.std[:, track.states.index("ground_slip_left_ratio")].max() < 1.3 * module.FIRST_RATIO
-=======
-    most = np.maximum(module.SLOW_RATIO, np.abs(track.state("ground_slip_left_ratio")))
+    most = np.maximum(module.FIRST_RATIO, np.abs(track.state("ground_slip_left_ratio")))
     assert (track.std[:, track.states.index("ground_slip_left_ratio")] < 1.3 * most).all()
->>>>>>> 2a008bc9 (Slip filter: scatter of wheels' speeds is learned, slip by traction is a state, regressors without the noise of their tick; vibration as white noise, changes of slope and direction above noise)
 
 
 def test_the_covariance_is_one_where_poses_come_after_a_camera():
