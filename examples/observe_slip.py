@@ -5,8 +5,7 @@ python examples/observe_slip.py
 
 import numpy as np
 
-from terrain.estimation.live import LiveObserver
-from terrain.estimation.models.choice import make_observer
+from terrain.estimation.live import make_live_filter
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
 from terrain.simulation.plants.tracks import Slope, Stretch
@@ -21,7 +20,7 @@ def observe(seed: int = 1) -> list[tuple[str, float, float]]:
     speeds = np.full((1500, 2), 0.5)  # m/s of the left and the right track at 50 Hz
     run = simulate(robot, speeds, ground, seed, slope=Slope(0.2))
     channels = {name: stream.channels for name, stream in run.streams.items()}
-    observer, found = LiveObserver(make_observer("tracked", robot), robot, channels), []
+    observer, found = make_live_filter("tracked", robot, channels), []
     for sample in replay(run):
         for estimate in observer.step(sample.readings):
             if round(estimate.time_s * 50) % 250 == 0:

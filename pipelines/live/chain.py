@@ -31,7 +31,7 @@ from terrain.control.switching import (
 from terrain.control.traction import TractionStatus
 from terrain.estimation.clocks import Clocks, ClockWatch
 from terrain.estimation.filter import Filter
-from terrain.estimation.live import BIASES, Estimator, LiveEstimate
+from terrain.estimation.live import BIASES, Live, LiveEstimate
 from terrain.records import Command, Sample
 
 COMMAND_VALID_S = 0.25
@@ -105,7 +105,7 @@ class Chain:
 
     name = ""
     source: TerrainSource
-    _filter: Estimator | None = None
+    _filter: Live | None = None
 
     def __init__(
         self, robot_name: str, table: SlipTable, switching: SwitchSettings, clocks: Clocks | ClockWatch

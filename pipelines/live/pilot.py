@@ -34,7 +34,7 @@ from terrain.control.traction import TractionStatus
 from terrain.estimation.clocks import Clocks, check_channels, finite_twist
 from terrain.estimation.feed import places_among
 from terrain.estimation.health import Health
-from terrain.estimation.live import CHANNELS, Estimator, LiveEstimate, live_estimator
+from terrain.estimation.live import CHANNELS, Live, LiveEstimate, live_estimator
 from terrain.estimation.models.choice import suitable_filter
 from terrain.extension import correct_live
 from terrain.kinematics.logged_wheels import sensor_channels
@@ -90,7 +90,7 @@ class LivePilot(Chain):
 
     name = "pilot"
     estimate: LiveEstimate | None
-    _filter: Estimator | None
+    _filter: Live | None
     _clocks: Clocks
 
     def __init__(

@@ -21,7 +21,7 @@ from features.windows import (
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain.classify.terrain_filter import FilterSettings, check_settings
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.live import LIVE_FILTERS, Estimator, estimated_channels, make_live_filter
+from terrain.estimation.live import LIVE_FILTERS, Live, estimated_channels, make_live_filter
 from terrain.extension import correct_live
 from terrain.logs.replay import SENSORS, replay
 from terrain.logs.schema import ESTIMATED
@@ -66,13 +66,13 @@ def _gives(name: str, robot: Robot, info: ModelInfo) -> bool:
 
 def live_estimator(
     info: ModelInfo, robot: Robot, channels: Mapping[str, Sequence[str]]
-) -> tuple[Estimator | None, Robot]:
+) -> tuple[Live | None, Robot]:
     """Return the filter whose estimates a model needs, or None, and the robot as filters take it."""
     driven, correction = correct_live(robot)
     if not needs_filter(info, channels):
         return None, driven
     known = {stream: tuple(names) for stream, names in channels.items()}
-    return make_live_filter(live_filter(info, driven), driven, known, info.rate_hz, correction), driven
+    return make_live_filter(live_filter(info, driven), driven, known, correction), driven
 
 
 def feed_of(

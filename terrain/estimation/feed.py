@@ -11,7 +11,7 @@ signal goes through a low-pass too, and its own lag and the filter's together ar
    that sample as its input, which leaves no delay of the holding;
 5. rows that follow from others: vibration, changes of the wheels' speeds, rest.
 
-A whole log (:func:`measurement_table`) and the live chain (:class:`~terrain.estimation.live.LiveFilter`) take one
+A whole log (:func:`measurement_table`) and the live chain (:mod:`terrain.estimation.models.swerve_live`) take one
 compiled loop (:func:`run_feed`), live over one tick.  What looks ahead in a log is the cleaning, which leaves out and
 counts samples that cannot be true, the median periods and, unless ``causal``, latencies, the yaw at the start and the
 origin of positions.

@@ -615,7 +615,7 @@ class Filter:
     >>> filter.step(0.0, wheels), filter.step(0.0, np.full(len(filter.model.rows), np.nan))
     (True, False)
     >>> filter.model.rows[0], round(float(filter.mean[filter.model.states.index("speed_x_mps")]), 2)
-    ('wheel_1_radps', 0.4)
+    ('wheel_1_radps', 1.6)
     """
 
     def __init__(self, model: FilterModel, settings: FilterSettings = DEFAULT_SETTINGS) -> None:

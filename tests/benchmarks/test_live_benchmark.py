@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from terrain.estimation.live import LiveFilter
+from terrain.estimation.live import CHANNELS, make_live_filter
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
@@ -18,7 +18,7 @@ def test_a_live_step_leaves_a_control_loop_its_time(benchmark):
     samples = list(replay(simulate_run(robot, "grass", "straight", 0, duration_s=5.0)))
 
     def drive():
-        estimator = LiveFilter(robot)
+        estimator = make_live_filter("vio15", robot, CHANNELS)
         return sum(len(estimator.step(sample.readings)) for sample in samples)
 
     assert benchmark(drive) >= len(samples) - 1

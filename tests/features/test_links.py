@@ -53,7 +53,7 @@ def windows_over(run, name, arrival_s, rate_hz, is_driven):
     filter_name, estimated = ROBOTS[name]
     robot = load_robot(name)
     channels = {stream: run.streams[stream].channels for stream in arrival_s}
-    estimator = make_live_filter(filter_name, robot, channels, {})
+    estimator = make_live_filter(filter_name, robot, channels)
     feed = WindowFeed(
         RULE, layout_of(run, estimated), channels, estimated_channels(filter_name, robot), robot
     )

@@ -195,7 +195,7 @@ def test_wheels_that_are_steered_are_corrected_alike_block_by_block():
 
 def live_track(run, name, robot, correction):
     channels = {each: stream.channels for each, stream in run.streams.items()}
-    live = make_live_filter(name, robot, channels, {}, correction)
+    live = make_live_filter(name, robot, channels, correction)
     samples = islice(replay(run), N_SAMPLES)
     return np.array([each.mean for sample in samples for each in live.step(sample.readings)])
 

@@ -2,7 +2,7 @@
 
 A row holds what was measured at a tick of the wheels, NaN where a sensor gave nothing; it may be late,
 wrong or absent, and what comes out is never infinite.  A whole log (:func:`rows_of`, :func:`observe`), a run sample by
-sample (:class:`~terrain.estimation.live.LiveObserver`) and a simulated robot call the same step.
+sample (:class:`~terrain.estimation.live.Live`) and a simulated robot call the same step.
 
 Most observers are a :class:`~terrain.estimation.filter.FilterModel` and what its inputs are:
 :class:`FilterObserver`.
@@ -175,6 +175,25 @@ class Observer(ABC, _WithMemory):
     rows: tuple[str, ...]
     in_world = False
     reference_age_s, accel_mps2, reason = math.nan, math.nan, ""
+    kept: Filter | None = (
+        None  #: what may be kept over a restart; None of one that starts from its first samples
+    )
+    #: of each sensor at the last tick, as :data:`~terrain.estimation.health.SENSORS`; (0,) where none is judged
+    health = np.empty(0, np.int8)
+
+    @property
+    def health_names(self) -> dict[str, str]:
+        """Health of each sensor by name; empty where none is judged."""
+        return {}
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """What it did not believe, as counts by kind."""
+        return {}
+
+    def ahead(self, mean: Array, dt_s: float) -> Array | None:
+        """Return a mean (d,) predicted to a later time; None where it is not."""
+        return None
 
     @abstractmethod
     def step(self, row: Array, dt_s: float) -> ObserverOutput:
@@ -246,9 +265,13 @@ class ObserverFeed(_WithMemory):
     ----------
     queues : of the streams beside the wheels that are read
     last_s : stamp of the last tick; minus infinity before the first
+    speeds_mps, motor_radps : of the logged wheels at the last tick
+    period_s : of ticks that go on where the wheels give nothing; 0 for none
     dropped : what was left out, as counts by stream and kind: wheels not later than the sample before, late or
         inaccurate fixes, and clocks that were set back
     """
+
+    period_s = 0.0
 
     def __init__(
         self,
@@ -263,7 +286,7 @@ class ObserverFeed(_WithMemory):
         self._speeds = {
             name: wheels.index(rate) for name, rate in zip(names, robot.rate_channels, strict=True)
         }
-        self.speeds_mps = np.full(len(self._speeds), math.nan)  # of the logged wheels, at the last tick
+        self.speeds_mps = self.motor_radps = np.full(len(self._speeds), math.nan)
         self.mps_per_rate = robot.wheel_radius_m / robot.reduction_ratio if robot.by_motor else 1.0
         self._rows, self._takes_place = rows, "position_x_m" in rows
         self._fixes: dict[str, str] = {}
@@ -306,8 +329,9 @@ class ObserverFeed(_WithMemory):
         self.dropped["time: clock set" if is_set else "wheels: stamp does not increase"] += 1
         return -1 if is_set else 0
 
-    def tick(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> Array:
+    def tick(self, time_s: float, wheels: Array | None, due: Mapping[str, Due]) -> Array:
         """Return the row (m,) at a sample of the wheels, of the samples of other streams that came since the last."""
+        assert wheels is not None  # there are no ticks without
         step_s, self.last_s = time_s - self.last_s, time_s
         for name, samples in due.items():
             if not samples and self.queues[name].n_behind >= CLOCK_SET_SAMPLES:  # its own clock was set back
@@ -316,6 +340,8 @@ class ObserverFeed(_WithMemory):
         row = dict.fromkeys(self._rows, math.nan)
         speeds = {name: float(wheels[column]) * self.mps_per_rate for name, column in self._speeds.items()}
         self.speeds_mps = np.array(list(speeds.values()))
+        if self._robot.by_motor:
+            self.motor_radps = wheels[list(self._speeds.values())]
         row |= speeds | dict(zip(INERTIAL_ROWS, self._means("imu", time_s, due), strict=True))
         row |= zip(self._robot.steer_rows, self._means("steering", time_s, due, last=True), strict=True)
         if self._terms and isinstance(self._robot, BicycleRobot):

@@ -17,7 +17,7 @@ from pipelines.learn.training_data import data_of_runs, info_of, with_limits
 from pipelines.live.assess import NOT_LIKE, as_evidence, assess
 from pipelines.live.classifying import AT_MOST, MAX_WAITING, Classifier, WindowOutput, classify_window
 from terrain.classify.terrain_filter import check_settings, filter_run, reported
-from terrain.estimation.live import LiveFilter
+from terrain.estimation.live import CHANNELS, make_live_filter
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.replay import replay
 from terrain.logs.schema import ESTIMATOR_CHANNELS
@@ -31,7 +31,7 @@ ROBOT = load_robot("agrimaro")
 
 def estimated(run):
     """The run with the streams that ``enriched`` adds, of the estimator on the robot."""
-    estimator = LiveFilter(ROBOT)
+    estimator = make_live_filter("vio15", ROBOT, CHANNELS)
     estimates = [estimate for sample in replay(run) for estimate in estimator.step(sample.readings)]
     time_s = [estimate.time_s for estimate in estimates]
     motion = [[getattr(estimate, name) for name in ESTIMATOR_CHANNELS] for estimate in estimates]
@@ -51,7 +51,7 @@ def test_live_windows_and_outputs_equal_those_of_the_enriched_log(swerve_model, 
         return classify_window(model, window, recent)
 
     monkeypatch.setattr("pipelines.live.classifying.classify_window", classify)
-    classifier, estimator = Classifier(swerve_model, ROBOT), LiveFilter(ROBOT)
+    classifier, estimator = Classifier(swerve_model, ROBOT), make_live_filter("vio15", ROBOT, CHANNELS)
     for sample in replay(survey):
         new = classifier.update(sample, estimator.step(sample.readings))
         found += new

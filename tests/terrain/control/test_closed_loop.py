@@ -12,7 +12,7 @@ from terrain.control.robot_control import OPEN_LOOP, RobotControl
 from terrain.control.situations import SituationOptions, make_situation, simulate_situation, start_times
 from terrain.control.slip_table import load_slip_table
 from terrain.control.switching import OutputStatus, TerrainBelief
-from terrain.estimation.live import LiveFilter
+from terrain.estimation.live import CHANNELS, make_live_filter
 from terrain.robots import load_robot
 from terrain.simulation.scenario import Faults
 
@@ -24,7 +24,9 @@ class Loop:
 
     def __init__(self, name):
         controller = make_controller(name, TABLE, DELAY_S)
-        self.filter = None if controller.pilot.controller in OPEN_LOOP else LiveFilter(ROBOT)
+        self.filter = (
+            None if controller.pilot.controller in OPEN_LOOP else make_live_filter("vio15", ROBOT, CHANNELS)
+        )
         states = () if self.filter is None else self.filter.states
         self.control = RobotControl(ROBOT, controller.table, controller.pilot, states)
         self.belief, self.seen, self.time_s = TerrainBelief(controller.known_terrain, 1.0), None, math.nan

@@ -17,7 +17,7 @@ from terrain.control.robot_control import (
 )
 from terrain.control.slip_table import load_slip_table
 from terrain.estimation.health import SENSORS, Health
-from terrain.estimation.live import LiveFilter
+from terrain.estimation.live import CHANNELS, make_live_filter
 from terrain.records import Reading
 from terrain.robots import load_robot
 from terrain.slip_learning.curve import traction_ratio
@@ -28,7 +28,7 @@ ROBOT = load_robot("agrimaro")
 @pytest.fixture(scope="module")
 def standing():
     """The estimate of a robot that stands, and the states of its filter."""
-    estimator = LiveFilter(ROBOT)
+    estimator = make_live_filter("vio15", ROBOT, CHANNELS)
     estimator.step({"wheels": Reading(np.array([0.0]), np.zeros((1, 6)))})
     return estimator.latest, estimator.states
 

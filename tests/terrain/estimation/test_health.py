@@ -11,7 +11,7 @@ from terrain.control.fault_drives import START, STOP, make_fault_situation
 from terrain.control.slip_table import load_slip_table
 from terrain.estimation.clocks import Clocks
 from terrain.estimation.health import SENSORS, Health
-from terrain.estimation.live import LiveFilter
+from terrain.estimation.live import CHANNELS, make_live_filter
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
 from terrain.simulation.faults import FaultyBus, fault_catalogue
@@ -35,7 +35,7 @@ def samples(terrain="grass"):
 @cache
 def health(fault, given=samples):
     """Return times, and health (n, 13) at each, of a drive with a fault; without one where it is None."""
-    estimator, clocks, times_s, found = LiveFilter(ROBOT), Clocks(), [], []
+    estimator, clocks, times_s, found = make_live_filter("vio15", ROBOT, CHANNELS), Clocks(), [], []
 
     def estimate(sample):
         now_s, readings = clocks.step(sample.time_s, sample.readings)

@@ -10,7 +10,7 @@ import yaml
 
 from terrain.effects import PARAMETER, parameters_of
 from terrain.errors import ConfigError, OutsideRegionWarning
-from terrain.estimation.live import LiveFilter
+from terrain.estimation.live import CHANNELS, make_live_filter
 from terrain.estimation.observe import observe_run
 from terrain.extension import (
     Origin,
@@ -232,7 +232,7 @@ def test_a_live_filter_warns_once(fastest_mps, n):
     run = simulate_run(AGRIMARO, "grass", "straight", 0, 1, duration_s=8.0)
     region = Region((-fastest_mps, fastest_mps), (-3.0, 3.0), None, ())
     robot, correction = correct_live(within("agrimaro", region))
-    estimator = LiveFilter(robot, correction=correction)
+    estimator = make_live_filter("vio15", robot, CHANNELS, correction)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for sample in replay(run):

@@ -12,7 +12,7 @@ import terrain
 from terrain.effects import Stage, in_plant, on_samples, parameters_of
 from terrain.errors import ConfigError
 from terrain.estimation.estimate import enriched, estimate_run, model_of, summarize
-from terrain.estimation.live import LiveFilter
+from terrain.estimation.live import CHANNELS, make_live_filter
 from terrain.extension import (
     Correction,
     apply_homes,
@@ -240,7 +240,10 @@ def test_corrections_are_applied_at_the_edge_and_filters_refuse_what_is_not_corr
             found.add(path.relative_to(root).as_posix())
     assert found == EDGES
     robot, run = extended(camera_yaw_rad=0.1), run_of("straight", 5.0)
-    for refused in (lambda: model_of(run, robot, "vio15"), lambda: LiveFilter(robot)):
+    for refused in (
+        lambda: model_of(run, robot, "vio15"),
+        lambda: make_live_filter("vio15", robot, CHANNELS),
+    ):
         with pytest.raises(ConfigError, match="camera_yaw_rad is not corrected"):
             refused()
     check_corrected(extended(force_slip_ratio=0.1))  # which filters do not model
@@ -251,14 +254,14 @@ def test_corrections_are_applied_at_the_edge_and_filters_refuse_what_is_not_corr
 
 def live_estimator(robot, channels):
     believed, correction = correct_live(robot)
-    return LiveFilter(believed, "vio15", channels, correction=correction)
+    return make_live_filter("vio15", believed, channels, correction)
 
 
 def test_live_is_live_on_the_corrected_log():
     effects = {name: EVERY[name] for name in EVERY if not name.startswith("clock")}
     run, robot = run_of("straight", 12.0, tuple(effects.items())), extended(**effects)
     channels = {name: run.streams[name].channels for name in ("wheels", "steering", "imu", "odometry")}
-    raw, plain = live_estimator(robot, channels), LiveFilter(corrected(robot), "vio15", channels)
+    raw, plain = live_estimator(robot, channels), make_live_filter("vio15", corrected(robot), channels)
     unshifted = replace(robot, effects={n: v for n, v in effects.items() if n != "steering_delay_s"})
     raw_now = live_estimator(unshifted, channels)
     now, desired = [], []

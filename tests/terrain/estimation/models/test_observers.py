@@ -7,7 +7,7 @@ import pytest
 
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.filter import FilterModel, FilterSettings, differentiate
-from terrain.estimation.live import LiveObserver
+from terrain.estimation.live import make_live_filter
 from terrain.estimation.models.choice import OBSERVERS, make_observer, observers_of
 from terrain.estimation.models.observer import (
     FIX_ROWS,
@@ -142,7 +142,7 @@ def test_what_is_no_time_unknown_or_waited_long_for_the_wheels_does_not_take_the
 
 def test_samples_that_cannot_be_are_left_out_and_counted(turning):
     channels = {name: stream.channels for name, stream in turning.streams.items()}
-    live, imu = LiveObserver(made("tracked"), UGV, channels), np.full((1, 9), 0.1)
+    live, imu = make_live_filter("tracked", UGV, channels), np.full((1, 9), 0.1)
     live.step({"wheels": Reading(np.array([0.0, 0.02]), np.full((2, 2), 0.1))})
     assert live.latest.time_s == 0.02
     live.step({"imu": Reading(np.array([0.03, 0.03]), np.vstack([imu, imu]))})
