@@ -94,7 +94,7 @@ def spoiled(row, column, value):
         ({R: entry(0.1, "m")}, f"{R} has the unit 'm'"),
         ({R: 0.1}, f"{R} is 0.1, a mapping"),
         ({"gyro_scale_ratio": entry(0.1)}, "covariance: key 'gyro_scale_ratio' is missing"),
-        ({"covariance": {R: {R: 1.0}}}, f"covariance: key {Y!r} is missing"),
+        ({"covariance": {R: {R: 1.0}}}, f"covariance: keys {Y!r}, "),
         ({"covariance": [[1.0]]}, "covariance is [[1.0]], a mapping"),
         (spoiled(R, Y, 1.0), "is not symmetric"),
         (spoiled(R, R, -1.0), "not positive semi-definite"),
