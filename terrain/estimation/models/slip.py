@@ -473,7 +473,7 @@ class SlipFilter(FilterObserver):
         speeds[np.isin(logged, across[np.isnan(angles)])] = np.nan  # of a wheel that drives who knows where
         self._speed_scatter = self._speed_scatter.after(self._time_s + dt_s, speeds, LEAST_WHEEL_STD_MPS)
         means_mps = np.where(np.isfinite(self._mean_mps), self._mean_mps, np.nan_to_num(speeds))
-        slow = np.abs(self.filter.mean[[_SLOW + group for group in self._wheels.groups[: speeds.size]]])
+        slow = self._slow_of(speeds.size)
         behind_mps = np.fmin(3.0 * self._speed_scatter.std / np.maximum(slow, LEAST_SLOW), np.abs(speeds))
         means_mps = np.clip(means_mps, *(np.nan_to_num(speeds) + sign * behind_mps for sign in (-1.0, 1.0)))
         gain, before_mps = -math.expm1(-dt_s / MEAN_S), means_mps[1]
@@ -492,7 +492,7 @@ class SlipFilter(FilterObserver):
         self._take_pose(given)
         references = self._place(given, inputs)
         z = np.concatenate([z, [gyro if abs(gyro) <= MOST_RADPS else np.nan], references])
-        variance = self._variance(given, rates_mps2, float(inputs[_SIZE - _D]), dt_s)
+        variance = self._variance(given, rates_mps2, inputs, dt_s)
         fix = self.advance(dt_s, z, inputs, self._walk(given, inputs, rates_mps2, dt_s), variance, N_JUDGED)
         mean = self.filter.mean
         np.clip(mean[_GNSS_DELAY:], *self._bounds.T, out=mean[_GNSS_DELAY:])
@@ -515,6 +515,10 @@ class SlipFilter(FilterObserver):
         if is_lost or (self._is_placed and self.filter.cov[_YAW, _YAW] > LOST_RAD**2):
             self._is_placed, self._seen, self._weight, self._first[:] = False, 0j, 0.0, np.nan
         return output
+
+    def _slow_of(self, n: int) -> Array:
+        """Return the size (n,) of m of each logged wheel."""
+        return np.abs(self.filter.mean[[_SLOW + group for group in self._wheels.groups[:n]]])
 
     def _rates(self, speeds: Array, dt_s: float) -> Array:
         """Return how fast the speeds of the wheels change, behind a low-pass; 0 where it is not known."""
@@ -573,8 +577,7 @@ class SlipFilter(FilterObserver):
         inputs[: 3 * MOST_ROWS], inputs[_SPEEDS][:n], inputs[_TURNING] = rolling.ravel(), known, turning
         if self._robot.skids and size > 0.0:  # turning on the spot says nothing of slip straight ahead
             before_mps = before_mps * (1.0 - min(abs(float(turning[0])) / size, 1.0) ** 2)
-        groups = list(self._wheels.groups[:n])
-        sticks = np.clip(1.0 - np.abs(self.filter.mean[_SLOW:][groups]), 0.0, 1.0)  # slip ends at 1
+        sticks = np.clip(1.0 - self._slow_of(n), 0.0, 1.0)  # slip ends at 1
         pulled_mps2 = sticks * np.clip(rates_mps2, -MOST_PULL_MPS2, MOST_PULL_MPS2)
         inputs[_SMOOTH][:n], inputs[_PULLING][:n] = before_mps, np.abs(before_mps) * pulled_mps2
         inputs[_SIZE - _D :] = size, accel, self._since_fix(rates_mps2, rolling[:n, 0]), *ages
@@ -601,7 +604,7 @@ class SlipFilter(FilterObserver):
         self._apart_mps2 = 0.5 * abs(measured - by_wheels)
         return both
 
-    def _variance(self, given: Mapping[str, float], rates_mps2: Array, size_mps: float, dt_s: float) -> Array:
+    def _variance(self, given: Mapping[str, float], rates_mps2: Array, inputs: Array, dt_s: float) -> Array:
         """Return the variance of each measurement.
 
         A wheel's speed is a mean over a tick, half of one late.  A measured speed is of an age ago; what it has changed
@@ -609,8 +612,11 @@ class SlipFilter(FilterObserver):
         """
         scatter_mps = self._speed_scatter.std
         std = np.full(MOST_ROWS + 1 + len(_REFERENCES), scatter_mps.max())
-        std[: rates_mps2.size] = np.hypot(scatter_mps, 0.29 * dt_s * rates_mps2)
-        if size_mps < STANDING_MPS:
+        behind_mps = self._slow_of(len(scatter_mps)) * np.abs(
+            inputs[_SMOOTH][: len(scatter_mps)] - inputs[_SPEEDS][: len(scatter_mps)]
+        )
+        std[: rates_mps2.size] = np.sqrt(scatter_mps**2 + (0.29 * dt_s * rates_mps2) ** 2 + behind_mps**2)
+        if float(inputs[_SIZE - _D]) < STANDING_MPS:
             std[:MOST_ROWS] = REST_STD_MPS
         if self._robot.skids:
             left, right = (given[name] for name in self._speeds)
