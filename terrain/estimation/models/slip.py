@@ -358,7 +358,7 @@ class SlipFilter(FilterObserver):
     >>> rows[:, filter_.rows.index("gnss_std_m")] = 0.02
     >>> track = observe(filter_, time_s, rows)
     >>> track.slip[-1].round(2), track.slip_std[-1].round(2)
-    (array([0.1, 0.1]), array([0.02, 0.02]))
+    (array([0.1, 0.1]), array([0.03, 0.03]))
     """
 
     in_world = True
@@ -472,12 +472,12 @@ class SlipFilter(FilterObserver):
         angles, (logged, across, _) = np.array([given[name] for name in self._steer]), self._wheels
         speeds[np.isin(logged, across[np.isnan(angles)])] = np.nan  # of a wheel that drives who knows where
         self._speed_scatter = self._speed_scatter.after(self._time_s + dt_s, speeds, LEAST_WHEEL_STD_MPS)
-        means_mps = np.where(np.isfinite(self._mean_mps), self._mean_mps, np.nan_to_num(speeds))
+        means_mps = np.where(np.isfinite(self._mean_mps), self._mean_mps, _or_zero(speeds))
         slow = self._slow_of(speeds.size)
         behind_mps = np.fmin(3.0 * self._speed_scatter.std / np.maximum(slow, LEAST_SLOW), np.abs(speeds))
-        means_mps = np.clip(means_mps, *(np.nan_to_num(speeds) + sign * behind_mps for sign in (-1.0, 1.0)))
+        means_mps = np.clip(means_mps, *(_or_zero(speeds) + sign * behind_mps for sign in (-1.0, 1.0)))
         gain, before_mps = -math.expm1(-dt_s / MEAN_S), means_mps[1]
-        means_mps[0] += gain * np.nan_to_num(speeds - means_mps[0])
+        means_mps[0] += gain * _or_zero(speeds - means_mps[0])
         self._mean_mps = np.array([means_mps[0], before_mps + gain * (means_mps[0] - before_mps)])
         rates_mps2 = self._rates(speeds, dt_s)
         inputs = self._inputs(given, speeds, rates_mps2, before_mps, angles, dt_s)
@@ -486,7 +486,7 @@ class SlipFilter(FilterObserver):
         if np.isfinite(speeds).any():
             z[logged.size : logged.size + across.size] = 0.0 * angles
         if isinstance(self._robot, BicycleRobot):
-            z[logged.size] += math.sin(float(np.nan_to_num(angles[0]))) * float(self.filter.mean[_VX])
+            z[logged.size] += math.sin(float(_or_zero(angles[0]))) * float(self.filter.mean[_VX])
         gyro = given["yaw_rate_radps"]
         self._begin_delays(given)
         self._take_pose(given)
@@ -518,11 +518,11 @@ class SlipFilter(FilterObserver):
 
     def _slow_of(self, n: int) -> Array:
         """Return the size (n,) of m of each logged wheel."""
-        return np.abs(self.filter.mean[[_SLOW + group for group in self._wheels.groups[:n]]])
+        return np.asarray(np.abs(self.filter.mean[[_SLOW + group for group in self._wheels.groups[:n]]]))
 
     def _rates(self, speeds: Array, dt_s: float) -> Array:
         """Return how fast the speeds of the wheels change, behind a low-pass; 0 where it is not known."""
-        behind = np.nan_to_num(speeds - self._smooth_mps)
+        behind = _or_zero(speeds - self._smooth_mps)
         gain = -math.expm1(-dt_s / CHANGE_S)
         moved = np.where(np.isfinite(self._smooth_mps), self._smooth_mps + gain * behind, speeds)
         self._smooth_mps = np.where(np.isfinite(speeds), moved, self._smooth_mps)
@@ -545,8 +545,8 @@ class SlipFilter(FilterObserver):
         or stop, it would be a speed over ground.
         """
         n, inputs, (logged, across, _) = speeds.size, np.zeros(len(_INPUTS)), self._wheels
-        known, rolling, turning = np.nan_to_num(speeds), np.zeros((MOST_ROWS, 3)), np.zeros(MOST_ROWS)
-        smooth_mps = np.nan_to_num(self._smooth_mps)
+        known, rolling, turning = _or_zero(speeds), np.zeros((MOST_ROWS, 3)), np.zeros(MOST_ROWS)
+        smooth_mps = _or_zero(self._smooth_mps)
         sharp_mps = np.maximum(np.abs(known) - 3.0 * self._speed_scatter.std, 0.0)
         size = math.sqrt(max(float(np.mean(sharp_mps**2)), float(np.mean(smooth_mps**2))))
         rolling[:n] = self._rolling
@@ -555,7 +555,7 @@ class SlipFilter(FilterObserver):
                 np.array(self._robot.wheel_directions_rad),
                 self._robot.wheel_positions_m,
             )
-            directions[across] += np.nan_to_num(angles)
+            directions[across] += _or_zero(angles)
             rolling[:n] = rolling_matrix(positions_m, directions)[logged]
             rolling[n : n + across.size] = rolling_matrix(positions_m, directions + 0.5 * math.pi)[across]
         if self._robot.skids:
@@ -650,7 +650,7 @@ class SlipFilter(FilterObserver):
         walk[_ACCEL_BIAS] = (TILTED_WALK if has_pitch else UNTILTED_WALK) ** 2
         tight = float(np.abs(inputs[_TURNING]).max()) / size if size > STANDING_MPS else 0.0
         if size > STANDING_MPS:
-            smooth = np.nan_to_num(self._smooth_mps)
+            smooth = _or_zero(self._smooth_mps)
             pulls = smooth / max(float(np.linalg.norm(smooth)), STANDING_MPS)
             turned = float(np.linalg.norm(pulls - self._pulls))
             if has_pitch:  # what gravity asks of the wheels, in the direction that they turn
@@ -819,6 +819,10 @@ class SlipFilter(FilterObserver):
         return (
             f"it is uncertain by more than {UNKNOWN_RATIO:g}, {age_s:.1f} s after the last speed over ground"
         )
+
+
+def _or_zero(values: Any) -> Any:
+    return np.where(np.isfinite(values), values, 0.0)
 
 
 def _fading(variance: float, time_s: float, dt_s: float) -> float:
