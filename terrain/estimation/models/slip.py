@@ -87,7 +87,7 @@ MOST_PULL_MPS2 = 3.0
 YIELDING_RATIO = 0.3
 """Length over the radius of a wheel that it rolls from rest until the contact pulls: tyre and soil yield first, a track
 and a gear have slack; d is then of the order of 1."""
-FIRST_RATIO, SLOW_RATIO, SLOW_WALK = 0.5, 0.2, 0.02
+FIRST_RATIO, SLOW_RATIO, SLOW_WALK = 0.5, 0.2, 0.015
 """Of m at first, about 0, when it may be up to 1; that up to which it walks, and its walk in a second of driving."""
 TURN_WALK, GYRO_TURN_WALK, DIRECTION_RATIO = 0.02, 0.1, 0.1
 """Walk of chi within a second of turning, and that of a robot that skids beside a gyro, whose bias wheels that slip
@@ -109,7 +109,7 @@ BIAS_STD_RADPS, BIAS_WALK = 0.005, 2e-4
 ACCEL_WALK, FREE_WALK = 0.02, 1.0
 """Walk of the speed within a second beside an accelerometer, to which its vibration adds as white noise, and without
 one."""
-ACCEL_BIAS_STD, TILTED_WALK, UNTILTED_WALK = 0.6, 0.1, 0.3
+ACCEL_BIAS_STD, TILTED_WALK, UNTILTED_WALK = 0.6, 0.05, 0.3
 """Of the accelerometer's bias at first, and its walk within a second with a measured pitch, and without one, where it
 is the slope's gravity."""
 POSE_STD_M, POSE_STD_RAD, COMPASS_STD_RAD, CAMERA_STD_MPS, GNSS_SPEED_STD_MPS = 0.02, 0.02, 0.05, 0.03, 0.03
