@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import types
 import typing
 from collections.abc import Mapping
@@ -93,7 +94,7 @@ def next_command(step: str, given: Mapping[str, Any]) -> str:
     >>> next_command("terrain estimate --data DIR --out runs/", {"data": "raw/", "robot": "mine.yaml"})
     'terrain estimate --data raw/ --out runs/ --robot mine.yaml'
     """
-    words = step.split()
+    words = shlex.split(step)
     module = next((each.module for each in COMMANDS if words[:2] == ["terrain", each.name]), None)
     if module is None:
         return step
@@ -111,7 +112,7 @@ def next_command(step: str, given: Mapping[str, Any]) -> str:
             words += ["--robot", file]
         elif words[words.index("--robot") + 1] in ("ROBOT", robot_argument(load_robot(file).name)):
             words[words.index("--robot") + 1] = file
-    return " ".join(words)
+    return shlex.join(words)
 
 
 def described_options(model: type[Settings]) -> dict[str, list[tuple[str, str]]]:

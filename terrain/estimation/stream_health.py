@@ -3,7 +3,8 @@
 As :mod:`terrain.estimation.health` has it of the filters of swerve robots, of samples as they arrive::
 
     lost        nothing that is a number came for a quarter of a second, or two and a half of its periods
-    frozen      it repeats itself to the last bit on a robot that moves, four times longer than it has before
+    frozen      it repeats itself to the last bit on a robot that moves, four times longer than it has before; what has
+                never changed, as the pitch of an IMU that measures none, shows nothing
     stepped     its value jumped as no robot moves, and has not jumped back; after some seconds it is believed
     disagrees   speed over ground and accelerometer measure different changes of the speed
     gated       what measures the motion over ground comes, and the filter has believed none of it for as long
@@ -81,7 +82,7 @@ class _Seen:
 
     __slots__ = (
         *("apart", "came_s", "changed_s", "is_frozen", "jumped", "jumped_s", "longest_s"),
-        *("n_after", "n_same", "period_s", "scatter", "shown", "stamp_s", "usual", "value"),
+        *("n_after", "n_same", "period_s", "scatter", "shown", "stamp_s", "usual", "value", "varies"),
     )
 
     def __init__(self) -> None:
@@ -92,7 +93,7 @@ class _Seen:
         self.scatter = self.usual = SCATTER_MPS
         self.jumped = np.zeros(1)
         self.n_same = self.n_after = 0
-        self.is_frozen = False
+        self.is_frozen = self.varies = False
 
 
 class StreamHealth:
@@ -194,7 +195,7 @@ class StreamHealth:
     def _values(self, sensor: _Sensor, readings: Mapping[str, Reading]) -> Array | None:
         """Return what came of a sensor's stream; None of nothing, or of another number of columns."""
         reading = readings.get(sensor.stream)
-        fits = reading is not None and reading.values.shape[1] == self._widths[sensor.stream]
+        fits = reading is not None and reading.values.shape[1:] == (self._widths[sensor.stream],)
         return reading.values if reading is not None and fits else None
 
     def _take(
@@ -236,6 +237,7 @@ class StreamHealth:
         if before.size and passed_s > 0.0:
             seen.period_s += (min(passed_s, 1.0) - seen.period_s) * (0.1 if seen.period_s else 1.0)
         if not same:
+            seen.varies |= before.size > 0
             if moves and seen.n_same:
                 seen.longest_s = max(seen.longest_s, min(seen.stamp_s - seen.changed_s, REPEATED_S))
             seen.changed_s = stamp_s
@@ -266,7 +268,7 @@ class StreamHealth:
         # a wheel may stand; one that may not is seen not to follow its command
         may_repeat = sensor.stream == "steering" or (sensor.stream == "wheels" and not seen.value.any())
         seen.is_frozen = (
-            is_long and not may_repeat and (moves or seen.is_frozen)
+            is_long and seen.varies and not may_repeat and (moves or seen.is_frozen)
         )  # at rest, too, until it changes
         if seen.is_frozen:
             return Health.FROZEN

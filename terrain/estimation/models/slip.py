@@ -32,6 +32,9 @@ own instant, by its state, so that a receiver that is late leaves no error in th
 third differences of four samples that follow each other evenly, over the root of 20, their gain on white noise; motion
 adds its jerk times the cube of the period.
 
+**Frames.**  Poses and satellites are each of a frame of their own: the filter stays in the one that it began in, and
+takes the other where that one has been silent for :data:`LOST_S`.
+
 **Jumps.**  A pose or position that is rejected for :data:`terrain.estimation.filter.REOPEN_AFTER_S` is elsewhere: the
 position follows it, and speed and slip stay as they are, which what positions change by from there on measures.
 
@@ -172,11 +175,18 @@ _REFERENCES = (
     *("gnss_x_m", "gnss_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps"),
     *("pose_x_m", "pose_y_m", "pose_yaw_rad", "compass_rad", "camera_x_mps", "camera_y_mps"),
 )
-_DELAYS: dict[int, tuple[Any, ...]] = {  # state and names in a description, by the row that begins to measure
-    0: (_GNSS_DELAY, "gnss_delay_s"),
-    4: (_POSE_DELAY, "pose_delay_s", "lidar_delay_s"),
-    8: (_POSE_DELAY, "lidar_delay_s"),
-}
+_DELAYS: tuple[
+    tuple[int, int, tuple[str, ...]], ...
+] = (  # row that begins to measure, state, names in a description
+    (0, _GNSS_DELAY, ("gnss_delay_s",)),
+    (2, _GNSS_DELAY, ("gnss_delay_s",)),
+    (4, _POSE_DELAY, ("pose_delay_s", "lidar_delay_s")),
+    (8, _POSE_DELAY, ("odometry_delay_s", "lidar_delay_s")),
+)
+_OF_FIXES, _OF_POSES = (
+    [0, 1, 2, 3, 7],
+    [4, 5, 6],
+)  # places among them of satellites with a compass, and of poses
 _AGE_ROWS = ("gnss_age_s", "pose_age_s", "camera_age_s")
 _INERTIAL = ("yaw_rate_radps", "accel_x_mps2", "pitch_rad")
 
@@ -445,7 +455,7 @@ class SlipFilter(FilterObserver):
             angle_states=("yaw_rad",),
             angle_rows=("pose_yaw_rad", "compass_rad"),
         )
-        super().__init__(model, FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S))
+        super().__init__(model, FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S, LONGEST_GAP_S))
         place = robot.wheel_positions_m, robot.wheel_directions_rad, robot.roller_angles_rad
         self._rolling, self._steer = rolling_matrix(*place)[logged], steer
         self._smooth_mps, self._accel_mps2, self._shaken_square = np.full(len(logged), np.nan), math.nan, 0.0
@@ -458,7 +468,8 @@ class SlipFilter(FilterObserver):
         self._bounds = np.array(bounds)
         self._speed_scatter = Scatter.of([scatter_mps] * len(logged), N_SPEEDS)
         self._pose_scatter = Scatter.of([POSE_STD_M, POSE_STD_M, POSE_STD_RAD], N_POSES)
-        self._is_placed, self._first, self._seen, self._weight = False, np.full(2, np.nan, complex), 0j, 0.0
+        self._by_pose = False
+        self._leave_frame()
 
     def step(self, row: Array, dt_s: float) -> ObserverOutput:
         """Take a row of :attr:`rows`; the frame begins at the first pose, or where the heading becomes known."""
@@ -475,7 +486,8 @@ class SlipFilter(FilterObserver):
         means_mps = np.where(np.isfinite(self._mean_mps), self._mean_mps, _or_zero(speeds))
         slow = self._slow_of(speeds.size)
         behind_mps = np.fmin(3.0 * self._speed_scatter.std / np.maximum(slow, LEAST_SLOW), np.abs(speeds))
-        means_mps = np.clip(means_mps, *(_or_zero(speeds) + sign * behind_mps for sign in (-1.0, 1.0)))
+        held = [_or_zero(speeds) + sign * behind_mps for sign in (-1.0, 1.0)]
+        means_mps = np.where(np.isfinite(speeds), np.clip(means_mps, *held), means_mps)
         gain, before_mps = -math.expm1(-dt_s / MEAN_S), means_mps[1]
         means_mps[0] += gain * _or_zero(speeds - means_mps[0])
         self._mean_mps = np.array([means_mps[0], before_mps + gain * (means_mps[0] - before_mps)])
@@ -489,8 +501,8 @@ class SlipFilter(FilterObserver):
             z[logged.size] += math.sin(float(_or_zero(angles[0]))) * float(self.filter.mean[_VX])
         gyro = given["yaw_rate_radps"]
         self._begin_delays(given)
-        self._take_pose(given)
-        references = self._place(given, inputs)
+        self._take_pose(given, dt_s)
+        references = self._place(given, inputs, dt_s)
         z = np.concatenate([z, [gyro if abs(gyro) <= MOST_RADPS else np.nan], references])
         variance = self._variance(given, rates_mps2, inputs, dt_s)
         fix = self.advance(dt_s, z, inputs, self._walk(given, inputs, rates_mps2, dt_s), variance, N_JUDGED)
@@ -511,10 +523,15 @@ class SlipFilter(FilterObserver):
                 self.filter.model.initial_mean,
                 self.filter.model.initial_variance,
             )
-            self.filter.state["reference_age_s"], self._has_delays = math.inf, ()
+            self.filter.state["reference_age_s"], self._has_delays, self._accel_is_wrong = math.inf, (), False
+            output = output._replace(status=int(ObserverStatus.RESET))
         if is_lost or (self._is_placed and self.filter.cov[_YAW, _YAW] > LOST_RAD**2):
-            self._is_placed, self._seen, self._weight, self._first[:] = False, 0j, 0.0, np.nan
+            self._leave_frame()
         return output
+
+    def _leave_frame(self) -> None:
+        self._is_placed, self._seen, self._weight, self._frame_age_s = False, 0j, 0.0, 0.0
+        self._first = np.full(2, np.nan, complex)
 
     def _slow_of(self, n: int) -> Array:
         """Return the size (n,) of m of each logged wheel."""
@@ -682,29 +699,37 @@ class SlipFilter(FilterObserver):
 
     def _begin_delays(self, given: Mapping[str, float]) -> None:
         """Begin with the delays that the description has of what begins to measure."""
-        for first, (state, *names) in _DELAYS.items():
+        for first, state, names in _DELAYS:
             if state not in self._has_delays and math.isfinite(given[_REFERENCES[first]]):
                 self._has_delays = (*self._has_delays, state)
                 if known := [
                     self._robot.identified[name] for name in names if name in self._robot.identified
                 ]:
+                    self.filter.cov[state, :], self.filter.cov[:, state] = 0.0, 0.0
                     self.filter.mean[state], self.filter.cov[state, state] = known[0], KNOWN_STD_S**2
 
-    def _take_pose(self, given: Mapping[str, float]) -> None:
+    def _take_pose(self, given: Mapping[str, float], dt_s: float) -> None:
         """Learn how much poses scatter."""
         pose = np.array([given[name] for name in _REFERENCES[4:7]])
         if np.isfinite(pose).all():
-            at_s = self._time_s - (given["pose_age_s"] if math.isfinite(given["pose_age_s"]) else 0.0)
+            at_s = self._time_s + dt_s - (given["pose_age_s"] if math.isfinite(given["pose_age_s"]) else 0.0)
             last_rad = self._pose_scatter.last[-1, 3] if len(self._pose_scatter.last) else 0.0
             pose[2] = last_rad + wrapped(pose[2] - last_rad)
             least = np.array([LEAST_POSE_STD_M, LEAST_POSE_STD_M, LEAST_POSE_STD_RAD])
             self._pose_scatter = self._pose_scatter.after(at_s, pose, least)
 
-    def _place(self, given: Mapping[str, float], inputs: Array) -> Array:
+    def _place(self, given: Mapping[str, float], inputs: Array, dt_s: float) -> Array:
         """Return the references that are used at a tick, and begin their frame where that becomes possible."""
         z = np.array([given[name] for name in _REFERENCES])
-        if self._is_placed:
-            return z
+        for known in (slice(0, 2), slice(2, 4), slice(4, 6)):  # a half of a position or a velocity is none
+            z[known] += 0.0 * z[known].sum()
+        if self._is_placed:  # poses and satellites need not be of one frame: the one that it began in counts
+            own, other = (_OF_POSES, _OF_FIXES) if self._by_pose else (_OF_FIXES, _OF_POSES)
+            self._frame_age_s = 0.0 if np.isfinite(z[own]).any() else self._frame_age_s + dt_s
+            if self._frame_age_s <= LOST_S or np.isnan(z[other]).all():
+                z[other] = math.nan
+                return z
+            self._leave_frame()
         mean, cov, params, ages_s = (
             self.filter.mean,
             self.filter.cov,
@@ -744,7 +769,8 @@ class SlipFilter(FilterObserver):
             cov[:2, :2] += cov[late, late] * np.outer(along, along)
             cov[:2, _VX:] = np.outer(along, cov[late, _VX:])
             cov[_VX:, :2] = cov[:2, _VX:].T
-        self._is_placed = True
+        self._is_placed, self._by_pose = True, late == _POSE_DELAY
+        z[_OF_FIXES if self._by_pose else _OF_POSES] = math.nan
         return z
 
     def _turned(
@@ -796,11 +822,11 @@ class SlipFilter(FilterObserver):
             status = ObserverStatus.STANDING
         elif fix is ObserverStatus.OK and age_s > PREDICTED_S:
             status = ObserverStatus.PREDICTED
-        self.reference_age_s, self.reason = age_s, self._reason(age_s, slip, fastest)
+        self.reference_age_s, self.reason = age_s, self._reason(age_s, slip, speeds, fastest)
         std = np.sqrt(np.maximum(self.filter.cov.diagonal()[:d], 0.0))
         return ObserverOutput(mean[:d].copy(), std, slip, deviation, int(status))
 
-    def _reason(self, age_s: float, slip: Array, fastest_mps: Array) -> str:
+    def _reason(self, age_s: float, slip: Array, speeds: Array, fastest_mps: Array) -> str:
         """Return why no slip is known, in a sentence; empty where one is."""
         if np.isfinite(slip).any():
             return ""
@@ -812,7 +838,7 @@ class SlipFilter(FilterObserver):
             )
         if age_s == math.inf:
             return "no position, pose or speed over ground has come yet"
-        if np.isnan(fastest_mps).all():
+        if np.isnan(speeds).all():
             return "no speed of a wheel comes, or no angle of a steered one"
         if np.nanmax(fastest_mps) < MIN_SPEED_MPS:
             return "the wheels stand"

@@ -534,3 +534,73 @@ def test_slip_that_traction_takes_is_learned_and_holds_without_a_reference():
     j, late = track.states.index("slip_per_mps2"), time_s > 41.0
     assert track.mean[-1, j] == pytest.approx(0.2, abs=0.05)
     assert np.abs(track.slip[late, 0] - slip[late]).max() < 0.08
+
+
+@pytest.mark.parametrize("n_lost", [1, 20])
+def test_a_wheel_whose_speed_is_not_known_for_a_while_leaves_slip_as_it_is(n_lost):
+    time_s, rows, _ = drive(HUSKY, slip=0.3)
+    rows["speed_left_mps"][1000 : 1000 + n_lost] = np.nan
+    _, track = run_filter(HUSKY, time_s, rows)
+    assert np.abs(track.slip[1000:1200, 1] - 0.3).max() < 0.05
+
+
+def test_poses_and_satellites_of_two_frames_do_not_disturb_each_other():
+    time_s, rows, true = drive(HUSKY, slip=0.1)
+    posed = np.arange(len(time_s)) % 5 == 0
+    for name, value in (
+        ("pose_x_m", 50.0 - true["x"] * 0.0),
+        ("pose_y_m", true["x"]),
+        ("pose_yaw_rad", 1.57),
+    ):
+        rows[name] = np.where(posed & (time_s > 5.0) & (time_s < 20.0), value, np.nan)
+    rows["pose_age_s"] = 0.0 * time_s
+    _, track = run_filter(HUSKY, time_s, rows)
+    assert np.abs(track.slip[500:] - 0.1).max() < 0.05
+    begun = {
+        name: np.where(time_s < 5.0, np.nan, row) if name.startswith("gnss_") else row
+        for name, row in rows.items()
+    }
+    _, track = run_filter(HUSKY, time_s, begun)
+    assert (np.isfinite(track.slip[time_s > 25.0])).all()
+    assert np.abs(track.slip[time_s > 25.0] - 0.1).max() < 0.06
+
+
+def test_half_a_position_is_no_reference():
+    time_s, rows, _ = drive(HUSKY)
+    for name in ("gnss_x_m", "gnss_speed_x_mps"):
+        rows[name] = np.where(time_s > 10.0, np.nan, rows[name])
+    filter_, _ = run_filter(HUSKY, time_s, rows)
+    assert filter_.reference_age_s > 15.0
+
+
+def test_a_described_delay_of_speeds_alone_counts_and_the_covariance_stays_one():
+    described = replace(MINE, identified={"gnss_delay_s": 0.3})
+    time_s, rows, _ = drive(described, delay_s=0.3)
+    for name in ("gnss_x_m", "gnss_y_m"):
+        rows[name] = np.full(len(time_s), np.nan)
+    filter_, track = run_filter(described, time_s, rows)
+    assert track.state("gnss_delay_s")[-1] == pytest.approx(0.3, abs=0.06)
+    assert np.linalg.eigvalsh(filter_.filter.cov).min() > -1e-9
+
+
+def test_no_speed_of_a_wheel_is_the_reason_where_none_comes():
+    time_s, rows, _ = drive(HUSKY)
+    for name in ("speed_left_mps", "speed_right_mps"):
+        rows[name] = np.where(time_s > 20.0, np.nan, rows[name])
+    filter_, _ = run_filter(HUSKY, time_s, rows)
+    assert filter_.reason.startswith("no speed of a wheel comes")
+
+
+def test_ticks_further_apart_than_the_filter_bridges_are_taken_up():
+    time_s, rows, _ = drive(HUSKY)
+    filter_ = SlipFilter(HUSKY)
+    table = np.column_stack([rows.get(name, np.full(len(time_s), np.nan)) for name in filter_.rows])
+    for row in table[:500]:
+        filter_.step(row, PERIOD_S)
+    speeds = [filter_.rows.index(name) for name in ("speed_left_mps", "speed_right_mps")]
+    still = np.where(np.isin(np.arange(len(filter_.rows)), speeds), 0.0, np.nan)
+    for _ in range(20):
+        output = filter_.step(still, 1.2)
+    assert output.status == ObserverStatus.STANDING
+    assert abs(output.mean[filter_.states.index("speed_x_mps")]) < 0.01
+    assert filter_.reference_age_s > 10.0
