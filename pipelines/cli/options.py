@@ -93,26 +93,33 @@ def next_command(step: str, given: Mapping[str, Any]) -> str:
     --------
     >>> next_command("terrain estimate --data DIR --out runs/", {"data": "raw/", "robot": "mine.yaml"})
     'terrain estimate --data raw/ --out runs/ --robot mine.yaml'
+    >>> next_command("terrain estimate --data DIR --out runs/", {"data": "my logs/"})
+    "terrain estimate --data 'my logs/' --out runs/"
+    >>> next_command("terrain train --data it's/", {})
+    "terrain train --data it's/"
     """
-    words = shlex.split(step)
+    words = step.split()
     module = next((each.module for each in COMMANDS if words[:2] == ["terrain", each.name]), None)
     if module is None:
         return step
     fields = {field.alias for field in import_module(module).Settings.model_fields.values()}
     if "DIR" in words and given.get("data"):
-        words[words.index("DIR")] = str(given["data"])
+        words[words.index("DIR")] = shlex.quote(str(given["data"]))
         for name, option in (("layout", "--format"), ("mapping", "--mapping")):
             if given.get(name) and option in fields:
-                words += [option, str(given[name])]
+                words += [option, shlex.quote(str(given[name]))]
     if given.get("robot") and "--robot" in fields:
         from terrain.robots import load_robot, robot_argument
 
-        file = str(given["robot"])
+        file = shlex.quote(str(given["robot"]))
         if "--robot" not in words:
             words += ["--robot", file]
-        elif words[words.index("--robot") + 1] in ("ROBOT", robot_argument(load_robot(file).name)):
+        elif words[words.index("--robot") + 1] in (
+            "ROBOT",
+            robot_argument(load_robot(str(given["robot"])).name),
+        ):
             words[words.index("--robot") + 1] = file
-    return shlex.join(words)
+    return " ".join(words)
 
 
 def described_options(model: type[Settings]) -> dict[str, list[tuple[str, str]]]:

@@ -86,7 +86,10 @@ def test_a_dead_stream_is_named_within_three_tenths_of_a_second(stream, kind):
     gone = {"lost": None, "nan": np.full(len(CHANNELS[stream]), np.nan)}
     change = frozen(stream)
     if kind != "frozen":
-        change = lambda name, time_s, row: gone[kind] if name == stream and time_s >= FAULT_S else row  # noqa: E731
+
+        def change(name, time_s, row):
+            return gone[kind] if name == stream and time_s >= FAULT_S else row
+
     found = judged(change)
     named = Health.FROZEN if kind == "frozen" else Health.LOST
     for name, health in found.items():
