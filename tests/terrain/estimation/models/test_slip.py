@@ -538,8 +538,14 @@ def test_slip_that_traction_takes_is_learned_and_holds_without_a_reference():
 
 @pytest.mark.parametrize("n_lost", [1, 20])
 def test_a_wheel_whose_speed_is_not_known_for_a_while_leaves_slip_as_it_is(n_lost):
-    time_s, rows, _ = drive(HUSKY, slip=0.3)
+    time_s = PERIOD_S * np.arange(1500)  # straight ahead, so that the loss in turning is not known
+    rows = {name: np.ones(1500) for name in ("speed_left_mps", "speed_right_mps")}
     rows["speed_left_mps"][1000 : 1000 + n_lost] = np.nan
+    rows["yaw_rate_radps"] = rows["gnss_age_s"] = 0.0 * time_s
+    fixed = np.arange(1500) % 5 == 0
+    for name, value in (("gnss_x_m", 0.7 * time_s), ("gnss_y_m", 0.0 * time_s)):
+        rows[name] = np.where(fixed, value, np.nan)
+    rows["gnss_std_m"] = np.full(1500, 0.02)
     _, track = run_filter(HUSKY, time_s, rows)
     assert np.abs(track.slip[1000:1200, 1] - 0.3).max() < 0.05
 
