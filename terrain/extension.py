@@ -180,11 +180,12 @@ def _warn_of(drive: str, robot: Robot, beyond: str) -> None:
 class RegionMonitor:
     """Warns, once, when a robot that is driven live has been outside its region for :data:`OUTSIDE_S`.
 
-    ``compares`` states whether samples are compared: there is a region, and nothing was warned of yet.
+    ``compares`` states whether samples are compared: there is a region, and nothing was warned of yet; ``memory`` is
+    how long it was outside, and the time of the last sample.
     """
 
     def __init__(self, robot: Robot) -> None:
-        self._robot, self._outside_s, self._last_s = robot, 0.0, math.inf
+        self._robot, self.memory = robot, (0.0, math.inf)
         region = robot.region
         ranges = {} if region is None else region._asdict()
         self._limits = tuple(
@@ -198,13 +199,12 @@ class RegionMonitor:
         if not self.compares:
             return
         (slow, fast), (right, left) = self._limits
-        step_s = min(max(time_s - self._last_s, 0.0), MAX_STEP_S)
-        self._last_s = time_s
-        beyond = wheel_speed_mps < slow or wheel_speed_mps > fast
-        if not (beyond or yaw_rate_radps < right or yaw_rate_radps > left):
-            return
-        self._outside_s += step_s
-        if self._outside_s >= OUTSIDE_S and self._robot.region is not None:
+        outside_s, last_s = self.memory
+        beyond = wheel_speed_mps < slow or wheel_speed_mps > fast or yaw_rate_radps < right
+        if beyond or yaw_rate_radps > left:
+            outside_s += min(max(time_s - last_s, 0.0), MAX_STEP_S)
+        self.memory = outside_s, time_s
+        if outside_s >= OUTSIDE_S and self._robot.region is not None:
             self.compares = False
             now = Region((wheel_speed_mps,) * 2, (yaw_rate_radps,) * 2, None, ())
             _warn_of(f"the drive at {time_s:.1f} s", self._robot, outside(self._robot.region, now))

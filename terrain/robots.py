@@ -830,12 +830,13 @@ class BicycleRobot(Robot):
 
     def check_geometry(self, place: str) -> None:
         """Refuse dimensions that no body can have."""
-        super().check_geometry(place)
-        if not 0.0 < self.com_ahead_m < self.wheelbase_m:
+        # what is presumed of the axles follows from where the mass is
+        if self.wheelbase_m > 0.0 and not 0.0 < self.com_ahead_m < self.wheelbase_m:
             raise ConfigError(
                 f"{place}: com_ahead_m is {self.com_ahead_m:g}, between 0 and wheelbase_m "
                 f"({self.wheelbase_m:g} m) is required"
             )
+        super().check_geometry(place)
         if not 0.0 < self.steering_max_rad < np.pi / 2:
             raise ConfigError(
                 f"{place}: steering_max_rad is {self.steering_max_rad:g}, below pi/2 is required (degrees?)"

@@ -7,6 +7,10 @@ the wheels is a tick, whose estimate is known at once (:attr:`Live.latest`).  Fo
 late the estimator goes back to the tick before it, and takes all that has come since once more, in order: the same
 numbers as if nothing had been late.  Where the wheels give nothing, a filter's ticks go on by the caller's time.
 
+**One clock**: stamps of samples, ``now_s`` and the stamps of estimates are all of it, whatever it counts from.  Where
+streams or the caller have clocks of their own, :class:`~terrain.estimation.clocks.Clocks` brings their stamps onto the
+caller's time first; then ``now_s`` is the time that it returns.
+
 An estimate **settles** when every stream that comes has reached its tick, or when nothing that is later is taken
 any more: from then on it does not change.  :meth:`Live.step` returns those that have settled, so that windows are
 made of the same numbers over a bad link as over a good one.
@@ -55,7 +59,7 @@ _MOTION = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "acce
 class LiveEstimate(NamedTuple):
     """What is believed at one tick; arrays are the caller's to keep, and NaN where something is not known."""
 
-    time_s: float  #: stamp of the wheels
+    time_s: float  #: of the tick: the stamp of the wheels, or of a tick without them the caller's time
     mean: Array  #: (d,) states and their standard deviations, in the order of :attr:`Live.states`
     std: Array
     slip_ratio: Array  #: (wheels,) NaN where unknown or where the wheel stands
@@ -199,7 +203,11 @@ class Live:
         return self.model.health_names
 
     def at(self, now_s: float) -> LiveEstimate | None:
-        """Return the last estimate, where the model can its means predicted to a time; None before the first tick."""
+        """Return the last estimate, its means predicted to a time where the model can; None before the first tick.
+
+        ``now_s`` is by the clock of the stamps.  ``time_s`` of what is returned stays the stamp of the last tick, and
+        all that was measured, the deviations and the ages are those of it.
+        """
         seen = self.latest
         if seen is None or not 1e-3 < now_s - seen.time_s < SETTINGS.max_gap_s:
             return seen

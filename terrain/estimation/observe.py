@@ -75,7 +75,7 @@ def observe_run(
     time_s, rows, dropped = rows_of(log, driven, observer.rows, terms)
     missing = tuple(name for k, name in enumerate(observer.rows) if not np.isfinite(rows[:, k]).any())
     track = observe(observer, time_s, rows)
-    return ObserverEstimate(run, driven, observer, track, dropped, missing)
+    return ObserverEstimate(run, driven, observer, track, {**dropped, **observer.dropped}, missing)
 
 
 def with_estimates(found: ObserverEstimate) -> RunLog:

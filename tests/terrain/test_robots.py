@@ -20,6 +20,7 @@ from terrain.robots import (
     TricycleRobot,
     as_drive,
     load_robot,
+    robot_from,
 )
 from terrain.simulation.assumed import with_assumed
 
@@ -101,6 +102,15 @@ def test_impossible_dimensions_are_refused(robot, change, message):
         robot, change = robot.with_parts(body=replace(robot.body, **change["body"])), {}
     with pytest.raises(ConfigError, match=message):
         replace(robot, **change).check_geometry("robot")
+
+
+def test_a_centre_of_mass_beyond_the_wheelbase_is_named_and_not_what_follows_from_it():
+    described = yaml.safe_load((data_folder("robots") / "adap2e.yaml").read_text())
+    for presumed in ("front_cornering_npr", "rear_cornering_npr"):
+        del described[presumed]
+    described["com_ahead_m"] = {"value": 2.0, "unit": "m", "source": "written"}
+    with pytest.raises(ConfigError, match=r"^own\.yaml: com_ahead_m is 2, between 0 and wheelbase_m"):
+        robot_from("own.yaml", described)
 
 
 BAD_SIZES = [

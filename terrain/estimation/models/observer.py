@@ -200,6 +200,13 @@ class Observer(ABC, _WithMemory):
         """Take a row (m,) that comes a time after the one before, 0 at first; return what is known then."""
 
 
+def status_of_use(use: Array) -> ObserverStatus:
+    """Return what became of sensors (k,) at a tick, as a filter has it: OK, or that one was left out or reopened."""
+    if (use == REOPENED).any():
+        return ObserverStatus.RESET
+    return ObserverStatus.REJECTED if (use == GATED).any() else ObserverStatus.OK
+
+
 class FilterObserver(Observer):
     """An observer that is a filter: a subclass makes its inputs of a row, and its slips of the state.
 
@@ -237,9 +244,12 @@ class FilterObserver(Observer):
         use = self.filter.use
         self.age_s += dt_s
         self.age_s[(use == USED) | (use == REOPENED)] = 0.0
-        if (use[:n_judged] == REOPENED).any():
-            return ObserverStatus.RESET
-        return ObserverStatus.REJECTED if (use[:n_judged] == GATED).any() else ObserverStatus.OK
+        return status_of_use(use[:n_judged])
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """What the filter did not take."""
+        return self.filter.dropped
 
     def read(self, function: Any, inputs: Array) -> tuple[Array, Array]:
         """Return what a compiled function makes of state and parameters, and one standard deviation of each.

@@ -22,9 +22,10 @@ from terrain.estimation.models.slip_model import SlipModel
 from terrain.estimation.models.swerve import make_filter, scheduled
 from terrain.estimation.wheel_slip import wheel_slip
 from terrain.kinematics.logged_wheels import with_wheel_speeds
+from terrain.extension import OUTSIDE_S
 from terrain.logs.replay import replay
 from terrain.records import Reading, Stream
-from terrain.robots import load_robot
+from terrain.robots import Region, load_robot
 from terrain.simulation.plants.tracks import PrescribedSlip
 from terrain.simulation.run import simulate, simulate_run
 from terrain.simulation.scenario import Faults
@@ -98,7 +99,7 @@ def batch(run, robot=ROBOT, name="vio15", yaw=None):
         time_s, rows, dropped = rows_of(run, robot, observer.rows)
         track = observe(observer, time_s, rows)
         compared = ("mean", "std", "slip", "status")
-        return time_s, {what: getattr(track, what) for what in compared}, dropped
+        return time_s, {what: getattr(track, what) for what in compared}, {**dropped, **observer.dropped}
     table = measurement_table(run, robot, causal=True, initial_yaw_rad=yaw or 0.0)
     model = make_filter(name, robot, yaw is not None)
     samples = scheduled(model, table.z, table.gnss_variance)
@@ -497,11 +498,11 @@ def assert_same(estimator, expected):
     found, desired = (counted(one.dropped, "came late|ticks without wheels") for one in (estimator, expected))
     assert found == desired
     if estimator.filter is not None:
-        (at_s, feed), model = estimator._snapshot()
-        (other_s, other_feed), other_model = expected._snapshot()
+        (at_s, feed), (model, region) = estimator._snapshot()
+        (other_s, other_feed), (other_model, other_region) = expected._snapshot()
         for one, other in zip((feed, *model), (other_feed, *other_model), strict=True):
             assert one.tobytes() == other.tobytes()
-        assert at_s == other_s
+        assert (at_s, region) == (other_s, other_region)
 
 
 delays = st.lists(st.integers(0, MOST_STEPS), min_size=N_MIXED, max_size=N_MIXED)
@@ -512,6 +513,50 @@ delays = st.lists(st.integers(0, MOST_STEPS), min_size=N_MIXED, max_size=N_MIXED
 def test_late_samples_give_the_numbers_of_samples_in_time(delays_of, now):
     """Ticks without wheels, which were done for want of them, leave nothing behind."""
     assert_same(drive(delayed(delays_of), now), undelayed(now))
+
+
+def test_late_samples_do_not_count_the_time_outside_of_a_region_twice():
+    """It is less than what is warned of, but more where each rewind counts its ticks again."""
+    robot, late = replace(ROBOT, region=Region((-0.1, 0.1), None, None, ())), {"imu": [3, 4] * N_MIXED}
+    in_time, rewound = (drive(delayed(each), robot=robot).model for each in ({}, late))
+    assert 0.3 < in_time.snapshot()[1][0] < OUTSIDE_S
+    assert rewound.snapshot()[1] == in_time.snapshot()[1]
+
+
+def test_what_the_gate_of_an_observer_left_out_is_counted():
+    run = edited(skid_log(), "imu", put(8.0, 2.0, channel=2))
+    estimator = made(HUSKY, "slip", channels_of(run))
+    settled(estimator, (sample.readings for sample in replay(run)))
+    assert 5 <= estimator.dropped["gyro gated"] <= 30
+
+
+def turned(at_s, by_rad):
+    def edit(time_s, values):
+        values[time_s >= at_s, 8] += by_rad
+
+    return edit
+
+
+SAID = ObserverStatus  # by what a log shows, and between which times
+
+
+@pytest.mark.parametrize(
+    ("stream", "edit", "status", "from_s", "to_s"),
+    [
+        ("odometry", gap(-1.0, 3.0), SAID.STARTING, 0.0, 1.9),
+        ("odometry", gap(-1.0, 0.0), SAID.STANDING, 0.5, 0.9),
+        ("odometry", gap(-1.0, 0.0), SAID.OK, 6.0, 8.0),
+        ("odometry", gap(8.0, 2.0), SAID.PREDICTED, 8.2, 9.9),
+        ("wheels", put(8.0, np.nan, 50), SAID.BAD_INPUT, 8.0, 8.9),
+        ("imu", turned(8.0, 0.5), SAID.REJECTED, 8.13, 8.25),
+        ("imu", turned(8.0, 0.5), SAID.RESET, 8.25, 8.4),
+    ],
+)
+def test_a_swerve_robot_says_what_its_estimates_are_worth(stream, edit, status, from_s, to_s):
+    run = edited(log(), stream, edit)
+    found = settled(made(), (sample.readings for sample in replay(run)))
+    said = [one.status for one in found if from_s <= one.time_s < to_s]
+    assert status in said if status is SAID.RESET else set(said) == {status}
 
 
 @pytest.mark.parametrize("name", ["tracked", "slip-learning", "gyrodometry"])
