@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MAX_LINES = {"terrain": 57_536, "features": 2_671, "pipelines": 20_201, "tests": 51_247}
+MAX_LINES = {"terrain": 57_569, "features": 2_671, "pipelines": 20_201, "tests": 51_302}
 """Lines of Python, docstrings included."""
 
 
