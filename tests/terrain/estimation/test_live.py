@@ -21,8 +21,8 @@ from terrain.estimation.models.observer import ObserverStatus, observe, rows_of
 from terrain.estimation.models.slip_model import SlipModel
 from terrain.estimation.models.swerve import make_filter, scheduled
 from terrain.estimation.wheel_slip import wheel_slip
-from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.extension import OUTSIDE_S
+from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.replay import replay
 from terrain.records import Reading, Stream
 from terrain.robots import Region, load_robot
