@@ -48,20 +48,20 @@ from terrain.logs.plausibility import (
 from terrain.logs.run_folders import data_digest, joint_digest
 from terrain.records import WINDOW_COLUMNS, Array, RunLog, Stream, Windows
 
-FORMAT_VERSION = 8
+FORMAT_VERSION = 9
 
 
 class RunHead(NamedTuple):
     """What is known of a run without its samples."""
 
-    #: run_id, robot, filter, digest: of the run; the digest is of its content
+    #: run_id, robot, filter, digest, measured_digest: as :class:`~pipelines.learn.training_data.TrainedRun`
     run_id: str
     robot: str = ""
     filter: str = ""
     digest: str = ""
+    measured_digest: str = ""
     streams: Sequence[tuple[str, Sequence[str], float]] = ()  #: name, channels and sample period in s of each
     repaired: Mapping[str, int] = {}  #: what a repairing reader dropped, as counts by kind
-    print_digest: str = ""  #: of its samples, see :class:`~terrain.logs.duplicates.RunPrint`
     fault: str = ""  #: why it was skipped; empty of one that was read
     doubts: Sequence[Sequence[Any]] = ()  #: fields of the checks that are doubtful or implausible
     session: str = ""
@@ -147,7 +147,7 @@ def cached_data(
     list(parallel(_store_run, (rule, layout, extractor), todo, n_jobs, "features", progress))
     samples, features, moved = _table(chosen, files, rule)
     motion = None if wheel_stream(layout.channels) is None else moved
-    runs = trained_runs([head[:4] for head in chosen], samples)
+    runs = trained_runs([head[:5] for head in chosen], samples)
     digest = joint_digest([head.digest for head in chosen])
     data = TrainingData(samples, layout, unfitted, features, motion, runs, digest)
     return data, skipped, [*doubt_sentences(doubts)]
@@ -163,7 +163,7 @@ def _heads(
     def prints() -> Iterator[RunPrint]:
         for head, codes, time_s in parallel(_head, (place,), each, n_jobs, "channels", progress):
             heads.append(head)
-            yield RunPrint(codes, time_s, bytes.fromhex(head.print_digest))
+            yield RunPrint(codes, time_s, bytes.fromhex(head.measured_digest))
 
     pairs = [(heads[a].run_id, heads[b].run_id) for a, b in possible_pairs(prints())]
     found = Counter(head.run_id for head in heads if not head.fault)
@@ -201,9 +201,9 @@ def _head(place: Path, load: RunLoader) -> tuple[RunHead, Array, Array]:
         run.robot,
         run.filter,
         data_digest([run]),
+        prints.digest.hex(),
         tuple((name, stream.channels, _period_s(stream.time_s)) for name, stream in run.streams.items()),
         dict(run.dropped),
-        prints.digest.hex(),
         session=run.session,
         doubts=[tuple(doubt.check) for doubt in doubts_of({run.run_id: checks})],
     )

@@ -132,7 +132,10 @@ def compare(model: TerrainModel, info: ModelInfo, data: TrainingData) -> tuple[i
     """
     run_id, terrain, known = data.samples.run_id, data.samples.terrain, model.info.run_accuracy
     held_out = {run.run_id: run.digest for run in data.runs if run.digest in info.run_accuracy}
-    new = [name for name, digest in held_out.items() if digest not in model.info.run_digests]
+    trained = {
+        run.run_id for run in data.runs if model.info.trained_on_digests(run.digest, run.measured_digest)
+    }
+    new = [name for name in held_out if name not in trained]
     theirs = {name: known[held_out[name]] for name in held_out if held_out[name] in known and name not in new}
     rows = np.isin(run_id, new)
     probability = data.probabilities(model, rows) if rows.any() else None

@@ -109,10 +109,8 @@ def compare_models(
     from pipelines.learn.evaluate import evaluation_of
     from terrain.classify.held_out import HeldOut
     from terrain.classify.metrics import Outcome, compare_with_first
-    from terrain.logs.run_folders import data_digest
 
-    trained = {digest for model in models for digest in model.info.run_digests}
-    excluded = tuple(each.run_id for each in runs if data_digest([each]) in trained)
+    excluded = tuple(each.run_id for each in runs if any(model.info.trained_on(each) for model in models))
     kept = [each for each in runs if each.run_id not in excluded]
     if not kept:
         raise DataError(

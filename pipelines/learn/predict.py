@@ -124,9 +124,14 @@ class Predictions(Result):
     n_windows: int = described("windows")
     n_runs: int = described("runs that they are of")
     classes: tuple[str, ...] = described("terrains that the model has learned")
-    accuracy: float | None = described("windows whose nearest terrain is the label; None without labels", "1")
-    n_judged: int = described("windows whose label the model knows")
-    training_runs: tuple[str, ...] = described("runs that trained the model; their accuracy is not its skill")
+    accuracy: float | None = described(
+        "windows of runs that were not in training whose nearest terrain is the label; None without labels",
+        "1",
+    )
+    n_judged: int = described("windows of runs that were not in training whose label the model knows")
+    training_runs: tuple[str, ...] = described("runs that were in training")
+    training_accuracy: float | None = described("as the accuracy, of those; it says nothing of others", "1")
+    n_judged_training: int = described("windows of those whose label the model knows")
     repaired: Mapping[str, int] = described("what a repairing reader dropped, by kind")
     unknown_labels: Mapping[str, int] = described("windows by labels that the model was not trained on")
     n_unknown_labels: int = described("their number")
@@ -248,7 +253,6 @@ def predict(
     """
     from pipelines.live.assess import SessionStart
     from pipelines.live.windows import needs_filter, windows_of_log
-    from terrain.logs.run_folders import data_digest
 
     for each in runs:
         if table.robot and each.robot != table.robot:
@@ -272,7 +276,10 @@ def predict(
         if session.model.adaptation is not None and (text := session.model.adaptation.found):
             adapted.append(text if session.model.adaptation.start is None else f"{name}: {text}")
     classes = model.info.classes
-    judged = [row for row in rows if row.label in classes]
+    training = tuple(each.run_id for each in runs if model.info.trained_on(each))
+    known = [row for row in rows if row.label in classes]
+    judged = [row for row in known if row.run_id not in training]
+    trained = [row for row in known if row.run_id in training]
     accepted = [row for row in judged if row.terrain == row.nearest]
     right = sum(row.nearest == row.label for row in accepted)
     unknown = Counter(sorted(row.label for row in rows if row.label and row.label not in classes))
@@ -281,10 +288,12 @@ def predict(
         n_windows=len(rows),
         n_runs=len(runs),
         classes=classes,
-        accuracy=fmean(row.nearest == row.label for row in judged) if judged else None,
+        accuracy=_accuracy(judged),
         filtered_accuracy=fmean(row.filtered_terrain == row.label for row in judged) if judged else None,
         n_judged=len(judged),
-        training_runs=tuple(each.run_id for each in runs if data_digest([each]) in model.info.run_digests),
+        training_runs=training,
+        training_accuracy=_accuracy(trained),
+        n_judged_training=len(trained),
         repaired=dict(sum((Counter(each.dropped) for each in runs), Counter())),
         unknown_labels=dict(unknown),
         n_unknown_labels=unknown.total(),
@@ -309,6 +318,10 @@ def predict(
         adapted=tuple(dict.fromkeys(adapted)),
         adaptation=model.adaptation.status if model.adaptation and model.adaptation.shift else "",
     )
+
+
+def _accuracy(rows: Sequence[WindowPrediction]) -> float | None:
+    return fmean(row.nearest == row.label for row in rows) if rows else None
 
 
 def _filtered(parts: Sequence[Windows], assessed: Sequence[Assessed], info: ModelInfo) -> list[Array]:
@@ -377,9 +390,13 @@ def report(result: Predictions) -> Report:
     found = f"{plural(result.n_windows, 'window')} of {plural(result.n_runs, 'run')}: {shares or 'none'}"
     if result.accuracy is not None:
         right = format_value(result.accuracy, PERCENT)
-        found += f"; {right} of {result.n_judged} labelled ones are right"
-        if result.training_runs:
-            found += f", {len(result.training_runs)} runs of which trained the model"
+        of = "labelled ones of runs that were not in training" if result.training_runs else "labelled ones"
+        found += f"; {right} of {result.n_judged} {of} are right"
+    if result.training_runs:
+        from pipelines.live.model import training_words
+
+        trained = len(result.training_runs), result.training_accuracy, result.n_judged_training
+        found += f"; {training_words(*trained)}"
     more = len(stretches) - MAX_ROWS
     note = f"{more} stretches more; --out FILE.csv has every window" if more > 0 else ""
     return Report(
@@ -438,7 +455,6 @@ def _notes(result: Predictions) -> list[Part]:
         rate, low, high = result.known_refused
         refused = f"{format_value(rate, PERCENT)} ({format_value((low, high), PERCENT)}, 95 %)"
     notes = {
-        "of runs that the model was trained on the accuracy is no measure of its skill": result.training_runs,
         f"{result.n_unknown} of {result.n_windows} windows are like no terrain that was learned, or answer like none: "
         f"unknown, for which the table's fallback is used; of held-out windows of learned ones "
         f"{refused} are": result.n_unknown,

@@ -33,6 +33,7 @@ from terrain.classify.limits import (
 from terrain.classify.proposals import TakenOver, held_out_errors
 from terrain.classify.terrain_filter import choose_settings, novelty_evidence
 from terrain.errors import DataError
+from terrain.logs.duplicates import measured_digest
 from terrain.logs.run_folders import data_digest
 from terrain.logs.schema import ESTIMATED
 from terrain.records import Array, RunLog
@@ -41,17 +42,18 @@ from terrain.records import Array, RunLog
 class TrainedRun(NamedTuple):
     """A run that a model is trained on."""
 
-    #: run_id, robot, filter, digest: of the run; the digest is of its content
+    #: run_id, robot, filter, digest, measured_digest: of the run; digests are of its content, and of what was measured
     run_id: str
     robot: str
     filter: str
     digest: str
+    measured_digest: str
     terrain: str  #: of its windows; several by commas
     n_windows: int  #: of the run
 
 
-def trained_runs(runs: Iterable[tuple[str, str, str, str]], samples: Samples) -> tuple[TrainedRun, ...]:
-    """Return what is kept of runs, given by their first four fields, in a model trained on their windows."""
+def trained_runs(runs: Iterable[tuple[str, str, str, str, str]], samples: Samples) -> tuple[TrainedRun, ...]:
+    """Return what is kept of runs, given by their first fields, in a model trained on their windows."""
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     for run_id, terrain in zip(samples.run_id.tolist(), samples.terrain.tolist(), strict=True):
         counts[run_id][terrain] += 1
@@ -97,13 +99,16 @@ def data_of_runs(runs: Sequence[RunLog], settings: RecipeSettings) -> TrainingDa
     """Return what a recipe is fitted on, of runs; errors as :func:`features.protocols.samples_of`."""
     samples = samples_of(runs, settings.rule, settings.signal_sets, **settings.reading)
     windows, recipe = samples.windows, recipe_of(settings, settings.recipe)
+    digested = [
+        (run.run_id, run.robot, run.filter, data_digest([run]), measured_digest(run).hex()) for run in runs
+    ]
     return TrainingData(
         samples,
         Layout(windows.channels, windows.rate_hz),
         recipe,
         feature_matrix(recipe, windows),
         window_motion(windows),
-        trained_runs([(run.run_id, run.robot, run.filter, data_digest([run])) for run in runs], samples),
+        trained_runs(digested, samples),
         data_digest(runs),
     )
 
@@ -126,6 +131,7 @@ def info_of(data: TrainingData, settings: RecipeSettings, dataset: str) -> Model
         settings.rule,
         data.samples.terrain,
         run_digests=tuple(each.digest for each in runs),
+        measured_digests=tuple(each.measured_digest for each in runs),
         recipe=settings.recipe,
         signal_sets=settings.signal_sets,
         seed=settings.seed,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from features.windows import Layout, SteadyMotion, WindowRule
+from pipelines.report.numbers import format_value, plural
 from pipelines.report.results import described
 from terrain.classify.adaptation import Adaptation, adapt
 from terrain.classify.answers import Answers
@@ -14,7 +15,7 @@ from terrain.classify.limits import Novelty, SupportTable
 from terrain.classify.proposals import TakenOver
 from terrain.classify.terrain_filter import NOVELTY_WEIGHTS, SHARE_POWERS, FilterSettings
 from terrain.errors import DataError
-from terrain.records import Windows
+from terrain.records import RunLog, Windows
 
 NOTHING_TO_ADAPT = "the model knows no levels of currents or vibration that it could adapt by: train it anew"
 
@@ -39,6 +40,9 @@ class ModelInfo:
     recipe: str = described("what was trained")
     signal_sets: tuple[str, ...] = described("whose channels the features use")
     seed: int = described("deals runs into folds")
+    measured_digests: tuple[str, ...] = described(
+        "of what was measured in each, whatever its names, labels and estimates", default=()
+    )
     data_digest: str = described("digest of the training runs", default="")
     dataset: str = described("name of the training data", default="")
     commit: str = described("of the code", default="")
@@ -70,6 +74,17 @@ class ModelInfo:
     def rule(self) -> WindowRule:
         """How windows must be cut."""
         return WindowRule(self.window_s, self.stride_s, self.steady)
+
+    def trained_on(self, run: RunLog) -> bool:
+        """Whether a run was in training, by its content or by what was measured in it."""
+        from terrain.logs.duplicates import measured_digest
+        from terrain.logs.run_folders import data_digest
+
+        return self.trained_on_digests(data_digest([run]), measured_digest(run).hex())
+
+    def trained_on_digests(self, digest: str, measured: str) -> bool:
+        """Whether a run of these digests was in training."""
+        return digest in self.run_digests or (measured != "" and measured in self.measured_digests)
 
     @property
     def cut_words(self) -> str:
@@ -143,3 +158,12 @@ def with_start(model: TerrainModel, adapt: str, terrain: str) -> TerrainModel:
         return begun
     assert begun.adaptation is not None
     return begun._replace(adaptation=begun.adaptation._replace(start=None))
+
+
+def training_words(n_runs: int, accuracy: float | None, n_judged: int) -> str:
+    """Return the accuracy of runs that were in training, and what it does not say."""
+    of = plural(n_runs, "run")
+    if accuracy is None:
+        return f"{of} trained the model"
+    right = f"{format_value(accuracy, '.1%')} of {n_judged} labelled windows are right"
+    return f"of {of} that trained the model {right}, which says nothing of others"

@@ -17,7 +17,7 @@ from pipelines.data.datasets import load
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.settings import ReadSettings
 from pipelines.live.chain import Chain
-from pipelines.live.model import TerrainModel
+from pipelines.live.model import TerrainModel, training_words
 from pipelines.live.pilot import LivePilot
 from pipelines.live.session import chain_of
 from pipelines.live.windows import needs_filter
@@ -135,11 +135,14 @@ class WatchedBlock(NamedTuple):
 
 
 class ReplayResult(Result, Replayed):
-    """All runs, and the same figures over all of them."""
+    """All runs, and the same figures over all of them; the accuracy is of runs that were not in training."""
 
     model: str | None = described("as it was named")
     table_name: str = described("table of target slips")
     runs: tuple[ReplayedRun, ...] = described("terrain, belief and windows of each run")
+    training_runs: tuple[str, ...] = described("runs that were in training")
+    training_accuracy: float | None = described("as the accuracy, of those; it says nothing of others", "1")
+    n_judged_training: int = described("windows of those that were judged")
     skipped: tuple[str, ...] = described("a sentence for each run that could not be read")
     watch: str | None = described("extended robot that the runs were compared with", default=None)
     watch_doubt: str = described("why alarms may come more often than asked for", default="")
@@ -185,15 +188,23 @@ def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
             runs.append(replay_run(each, chain, settings, progress, stop, watch, blocks))
             if runs[-1].interrupted:
                 break
-    figures = replayed(
-        [window for each in runs for window in each.windows],
-        model,
-        sum(each.duration_s for each in runs),
-        sum(each.elapsed_s for each in runs),
-        interrupted=any(each.interrupted for each in runs),
+    trained = {log.run_id for log in logs if model is not None and model.info.trained_on(log)}
+    parts = ([run for run in runs if (run.run_id in trained) is known] for known in (False, True))
+    figures, of_trained = (
+        replayed(
+            [window for each in part for window in each.windows],
+            model,
+            sum(each.duration_s for each in runs),
+            sum(each.elapsed_s for each in runs),
+            interrupted=any(each.interrupted for each in runs),
+        )
+        for part in parts
     )
     return ReplayResult(
-        **figures,
+        **figures | {"n_windows": figures["n_windows"] + of_trained["n_windows"]},
+        training_runs=tuple(run.run_id for run in runs if run.run_id in trained),
+        training_accuracy=of_trained["accuracy"],
+        n_judged_training=of_trained["n_judged"],
         model=settings.model,
         table_name=table.name,
         runs=tuple(runs),
@@ -326,7 +337,11 @@ def report(result: ReplayResult) -> Report:
     accuracy = ""
     if result.accuracy is not None:
         right = format_value(result.accuracy, PERCENT)
-        accuracy = f", {right} of {result.n_judged} with a label classified rightly"
+        of = " of runs that were not in training" if result.training_runs else ""
+        accuracy = f", {right} of {result.n_judged} with a label{of} classified rightly"
+    if result.training_runs:
+        trained = len(result.training_runs), result.training_accuracy, result.n_judged_training
+        accuracy += f"; {training_words(*trained)}"
     panels = []
     for run in result.runs[:MAX_STRIPS]:
         if run.windows:

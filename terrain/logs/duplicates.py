@@ -131,8 +131,11 @@ def _scaled_heights(peaks: Array) -> tuple[Array, Array]:
     return centred / np.where(norm > 0.0, norm, 1.0)[:, None], varies
 
 
-def _digest(run: RunLog) -> bytes:
-    """Return what identifies the samples of the fastest measured stream; empty where they may repeat."""
+def measured_digest(run: RunLog) -> bytes:
+    """Return what identifies the samples of the fastest measured stream; empty where they may repeat.
+
+    Neither names, labels nor estimates that were added change it.
+    """
     stream, places = max(_measured(run), key=lambda each: each[0].rate_hz, default=(None, []))
     if stream is None:
         return b""
@@ -140,7 +143,7 @@ def _digest(run: RunLog) -> bytes:
         values = stream.values[:, places].astype(np.float32)
     if max(len(np.unique(column)) for column in values.T) < min(MIN_DISTINCT, len(values)):
         return b""
-    return hashlib.blake2b(np.ascontiguousarray(values + np.float32(0.0)).tobytes()).digest()
+    return hashlib.blake2b(np.ascontiguousarray(values + np.float32(0.0)).tobytes(), digest_size=16).digest()
 
 
 def _same_digests(digests: Iterable[bytes]) -> list[tuple[int, int]]:
@@ -162,7 +165,7 @@ def run_print(run: RunLog) -> RunPrint:
     """Return the fingerprints of a run."""
     codes, start, peaks = _fingerprints([run])
     varies = _scaled_heights(peaks[start[:, None] + np.arange(N_PEAKS)])[1]
-    return RunPrint(codes[varies], peaks["time_s"][start[varies]], _digest(run))
+    return RunPrint(codes[varies], peaks["time_s"][start[varies]], measured_digest(run))
 
 
 def possible_pairs(prints: Iterable[RunPrint]) -> list[tuple[int, int]]:
@@ -268,7 +271,7 @@ def shared_stretches(runs: Sequence[RunLog]) -> tuple[SharedStretch, ...]:
         stretches = _stretches(rows, runs[first], runs[second])
         shared += stretches
         known |= {(first, second)} if stretches else set()
-    for first, second in _same_digests(map(_digest, runs)):
+    for first, second in _same_digests(map(measured_digest, runs)):
         if (first, second) not in known:
             ids = runs[first].run_id, runs[second].run_id
             shared.append(SharedStretch(*ids, *_span(runs[first]), *_span(runs[second])))

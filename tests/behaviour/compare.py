@@ -21,6 +21,8 @@ IGNORED: dict[str, str] = {
     "commit": "state of the code",
     "data_digest": "the last bit of one sample changes it; the samples are compared themselves",
     "digest": "the last bit of one sample changes it; the samples are compared themselves",
+    "measured_digest": "the last bit of one sample changes it; the samples are compared themselves",
+    "measured_digests": "the last bit of one sample changes it; the samples are compared themselves",
     "run_accuracy": "by digest; the accuracy of each run is that of the evaluation",
 }
 """Keys whose values are not compared, and why; the keys have to be there."""

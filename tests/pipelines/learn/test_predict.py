@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.learn.predict import NOT_LEARNED, Settings, predict, run
+from pipelines.learn.predict import NOT_LEARNED, Settings, predict, report, run
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.training_data import fitted_model
 from pipelines.report.results import as_json
@@ -59,6 +59,29 @@ def test_a_model_of_some_signals_needs_no_others_and_names_its_training_runs(run
     bare = RunLog("new", "husky", {"imu": new.streams["imu"]}, new.labels)
     assert predict([bare], model, TABLE).n_windows == 12
     assert predict([runs[0], new], model, TABLE).training_runs == (runs[0].run_id,)
+
+
+def test_runs_that_were_in_training_are_judged_apart_whatever_was_added_to_them(runs, drive):
+    """A name, a label or estimates make no other run of the same measurements."""
+    trained = [run for run in runs if run.run_id[-1] in "12"]
+    model = fitted_model(trained, RecipeSettings(signal_sets=("imu",)))
+    new, old = drive("new", "GRASS", 8), next(run for run in trained if run.run_id == "GRASS_1")
+    wheels = old.streams["wheels"]
+    estimated = with_stream(old, "slip", wheels.time_s, wheels.values[:, :1], ("slip_left_ratio",))
+    again = replace(estimated, run_id="again", session="second")
+    alone, found = predict([new], model, TABLE), predict([new, again], model, TABLE)
+    assert (alone.training_runs, found.training_runs) == ((), ("again",))
+    for name in ("accuracy", "filtered_accuracy", "accuracy_refusing", "accuracy_accepted", "n_judged"):
+        assert getattr(found, name) == getattr(alone, name)
+    assert (found.n_judged_training, found.n_windows) == (12, 24)
+    right = [row.nearest == "GRASS" for row in found.windows if row.run_id == "again"]
+    assert found.training_accuracy == pytest.approx(np.mean(right))
+    answer = report(found).answer
+    assert "of 12 labelled ones of runs that were not in training are right" in answer
+    assert answer.endswith("of 12 labelled windows are right, which says nothing of others.")
+    only = predict([again], model, TABLE)
+    assert (only.accuracy, only.n_judged) == (None, 0)
+    assert "; of 1 run that trained the model " in report(only).answer
 
 
 def test_labels_that_were_not_trained_are_predicted_counted_and_not_judged(model, drive, drive_all):

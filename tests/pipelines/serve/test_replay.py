@@ -114,7 +114,9 @@ def test_serve_replays_all_runs_of_a_folder_as_predict_and_prints_changes(
     ]
     found, expected = ([one.probability for one in each] for each in (windows, rows.windows))
     np.testing.assert_allclose(found, expected, atol=1e-12)
-    assert (result.accuracy, result.n_judged) == (rows.accuracy, rows.n_judged)
+    for name in ("accuracy", "n_judged", "training_runs", "training_accuracy", "n_judged_training"):
+        assert getattr(result, name) == getattr(rows, name)
+    assert len(rows.training_runs) == 2
     assert result.n_windows == len(windows) > 16
     assert not result.interrupted
     printed, changes = capsys.readouterr().out.splitlines(), []
