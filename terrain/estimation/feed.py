@@ -66,6 +66,9 @@ MAX_AGE_PERIODS = 1.5
 #: periods, so that half of one between two of them leaves nothing to how stamps are rounded, nor to whether the
 #: period is that of a description (live) or the median of a log (batch).
 GAP_PERIODS = 5.5
+#: So many time constants after such a start a low-pass has forgotten it: till then it is ahead of one that ran on, of a
+#: yaw by the turn rate times the time constant, and gives nothing.
+SETTLED_LAGS = 5.0
 #: A value that has jumped and stays is accepted after this long: it is left to the filter's gate.
 BELIEVED_S = 0.1
 #: The camera tells 0, 1/3, 2/3 or 1; at 1/3 (low) and below it has lost its features.
@@ -205,7 +208,9 @@ LIMIT = record(numbers("time_constant_s gap_s age_s jump jump_per_s") | {"once":
 #: passing the last sample, taken or not, its instant, the sum of its jumps, since when that is not 0, and whether a
 #: sample before it is known to be right.
 LINE = record(
-    numbers("value instant_s came_s low_passed judged judged_s jumping_s raw raw_s jumped_by jumped_s")
+    numbers(
+        "value instant_s came_s low_passed judged judged_s jumping_s raw raw_s jumped_by jumped_s settled_s"
+    )
     | {"was_given": bool, "is_followed": bool}
 )
 #: Of a channel that may freeze: last value, number of repetitions, longest run, and whether this one began in motion.
@@ -353,7 +358,9 @@ def _take(value: float, instant_s: float, came_s: float, line: Any, limit: Any) 
             return True
     line.judged, line.judged_s, line.jumping_s = value, instant_s, np.nan
     step_s, smooth = instant_s - line.instant_s, value
-    if limit.time_constant_s > 0.0 and step_s <= limit.gap_s:
+    if step_s > limit.gap_s:
+        line.settled_s = instant_s + SETTLED_LAGS * limit.time_constant_s
+    elif limit.time_constant_s > 0.0 and step_s <= limit.gap_s:
         smooth = low_pass_step(value, line.value, line.low_passed, step_s, limit.time_constant_s)
     line.value, line.instant_s, line.came_s, line.low_passed = value, instant_s, came_s, smooth
     line.was_given = False
@@ -369,7 +376,7 @@ def _at_tick(time_s: float, line: Any, limit: Any) -> float:
     """
     given = limit.once and line.was_given
     line.was_given = True
-    if given or not time_s - line.came_s <= limit.age_s + TICK_S:
+    if given or line.instant_s < line.settled_s or not time_s - line.came_s <= limit.age_s + TICK_S:
         return np.nan
     behind = line.low_passed - line.value
     if limit.time_constant_s > 0.0:

@@ -135,7 +135,9 @@ _SENSORS: dict[str, tuple[tuple[str, ...], float | tuple[float, ...]]] = {
     "wheel_1": (_WHEEL_ROWS[:1], 0.007),
     "wheel_2": (_WHEEL_ROWS[1:2], 0.007),
     "wheel_3": (_WHEEL_ROWS[2:], 0.007),
-    "rest": (_REST_ROWS, (0.005, 0.005, 0.002)),
+    # On soft ground a robot whose wheels stand still turns by 2 mrad/s, evenly, for the second that a stop lasts: one
+    # error a stop, which in each of its fifty ticks counts as sqrt(50) times as large.
+    "rest": (_REST_ROWS, (0.005, 0.005, 0.015)),
 }
 _SLIP_STD_MPS = 0.15  # wheel speed minus ground speed, where both are measured and slip is no state (vio12)
 _HELD = ("camera_yaw_rate", "camera_yaw", "gyro", "camera_speed", "accel", "rest")

@@ -179,13 +179,17 @@ def plain_derived(clock, table, once, twice, imu_s, accel_z, robot):
 
 
 def plain_low_pass(time_s, value, tau_s, gap_s):
-    out = np.array(value)
+    """Return the low-passed value, and whether it has forgotten where it started after the last gap."""
+    out, begun_s, settled = np.array(value), -np.inf, np.ones(value.size, bool)
     for k in range(1, value.size):
         step_s = time_s[k] - time_s[k - 1]
-        if step_s <= gap_s and tau_s > 0:
+        if step_s > gap_s:
+            begun_s = time_s[k]
+        elif tau_s > 0:
             lead = tau_s * (value[k] - value[k - 1]) / step_s
             out[k] = value[k] - lead + np.exp(-step_s / tau_s) * (out[k - 1] - value[k - 1] + lead)
-    return out
+        settled[k] = time_s[k] >= begun_s + feed.SETTLED_LAGS * tau_s
+    return out, settled
 
 
 def plain_held(clock, time_s, period_s):
@@ -204,7 +208,8 @@ def plain_on_clock(clock, time_s, came_s, signal, tau_s):
     known, period_s = np.isfinite(signal), np.median(np.diff(time_s))
     held = plain_held(clock, came_s[known], period_s)
     taken, out = held[held >= 0], np.full(clock.size, np.nan)
-    behind = plain_low_pass(time_s[known], signal[known], tau_s, feed.GAP_PERIODS * period_s) - signal[known]
+    low_passed, settled = plain_low_pass(time_s[known], signal[known], tau_s, feed.GAP_PERIODS * period_s)
+    behind = np.where(settled, low_passed - signal[known], np.nan)
     decay = np.exp((time_s[known][taken] - clock[held >= 0]) / tau_s) if tau_s > 0 else 1.0
     out[held >= 0] = signal[known][taken] + behind[taken] * decay
     return out

@@ -159,6 +159,16 @@ def test_a_camera_without_rotation_or_confidence_is_left_out_and_counted():
         assert np.isnan(table.columns(CAMERA_ROWS)[lost]).all()
 
 
+def test_rows_after_a_gap_are_behind_the_same_low_pass_as_ever():
+    """What starts anew would be 20 mrad of yaw ahead; the camera counts again when that is forgotten."""
+    run = change(RUN, "odometry", set_rows(lambda t: (t >= 2.0) & (t < 3.0), np.nan))
+    plain, table = (measurement_table(each, bare(0.05)).columns(CAMERA_ROWS) for each in (RUN, run))
+    time_s = RUN.streams["wheels"].time_s
+    known = np.isfinite(table).all(axis=1) & (time_s >= 3.0)
+    assert known[time_s > 3.3].all()
+    np.testing.assert_allclose(table[known], plain[known], rtol=0, atol=5 * NOISE)
+
+
 def test_stamps_that_do_not_increase_cost_their_sample_only_and_a_clock_set_back_its_shorter_part():
     def spoil(time_s, values, _):
         time_s[100] = time_s[99]  # a repeat

@@ -196,6 +196,16 @@ def test_a_robot_at_rest_keeps_its_position_without_a_camera_and_locked_wheels_t
     assert rest[time_s > 9.5].all()
 
 
+def test_a_stop_of_a_second_on_soft_ground_in_which_the_robot_still_turns_is_no_bias_of_the_gyro():
+    """It creeps by 4 mrad/s while its wheels stand, just as the camera is lost."""
+    lost = Faults(camera_lost_s=((20.0, 30.0),), by_chance=False)
+    run = simulate_run(ROBOT, "dry_sand", "survey", 83200, 4, vary=True, faults=lost)
+    found = estimate_run(run, ROBOT, "vio15")
+    assert np.nanmean(nees(found.track, found.truth, ["gyro_bias_radps"])) < 2.0
+    back = found.track.time_s > 30.3
+    assert np.nanmean(nees(found.track, found.truth, ["yaw_rad"])[back]) < 2.0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("terrain", soil_names())
 def test_errors_are_those_stated_in_runs_of_a_minute_and_in_starts_long_after_the_camera_was_lost(terrain):
@@ -214,7 +224,9 @@ def test_errors_are_those_stated_in_runs_of_a_minute_and_in_starts_long_after_th
         drive = from_commands("restart", ROBOT, terrain, commands)
         lost = Faults(camera_lost_s=((ends[2], ends[-1]),), by_chance=False)
         run = simulate_run(ROBOT, terrain, drive, 2900, number, vary=True, faults=lost)
-        slip = estimate_run(run, ROBOT, "vio15").slip
+        found = estimate_run(run, ROBOT, "vio15")
+        slip, bias = found.slip, nees(found.track, found.truth, ["gyro_bias_radps"])
+        squares["gyro_bias_radps"].append(np.nanmean(bias[found.track.time_s > ends[2]]))
         error = np.abs(slip.slip_ratio - lagged_slip_at(run, ROBOT, slip.time_s))[slip.time_s > ends[5]]
         known = np.isfinite(error)
         inside.append((error < 1.96 * slip.slip_std[slip.time_s > ends[5]])[known].mean())
