@@ -20,6 +20,9 @@ its speed over ground along it, and s* the target slip::
   s*)`` (as :mod:`terrain.control.pid` normalises it), acting on the chassis instead of each wheel.
 - Below v_l the slip ratio carries little information on the terrain: v_l replaces the robot's speed, and d rises
   as it does while no correction can be made.
+- On hard ground slip is small, and follows from the acceleration: of all rises of d to a speed within a distance a
+  constant one slips least, but for the first v_0, which wheels may slip by, as slip is none below.  There d rises at
+  once, and by so much less later.
 - A receiver moves q at each fix, by centimetres per second: a command that follows at once makes the wheels slip by as
   much, so that it follows by the acceleration between fixes, and reaches them within T.
 - q is delayed by the filter's lag and the command by its transport; t compensates both with the acceleration a',
@@ -66,6 +69,7 @@ class TractionSettings(NamedTuple):
     #: a robot that is held back accelerates at least by this, or the floor of s* rises
     gain_least_mps2: float = 0.25
     floor_rate_ratio: float = 0.15  #: rate at which the floor rises, per second
+    step_mps: float = 0.0  #: up to it d rises at once
     rise_mps2: float = math.inf  #: largest rate at which d rises
     fade_mps2: float = 1.0  #: rate at which d approaches w while no correction can be made
     #: reduction of a wheel's speed per torque above the mean; its limit as a fraction of the wheel's speed; time
@@ -87,8 +91,8 @@ class TractionSettings(NamedTuple):
 SETTINGS = TractionSettings()
 #: Of other than swerve robots: a satellite receiver or a camera gives a speed to 3 or 4 cm/s, which near the launch
 #: speed is 0.2 of slip, and less than half of what a start takes without control; what is not known is driven as by a
-#: ramp, slower than the usual 1 m/s^2, and that is the fastest; an acceleration behind a low-pass does last; a robot
-#: that gains less than half of it loses more distance than slip is worth.
+#: ramp, slower than the usual 1 m/s^2 behind a first step, and that is the fastest; an acceleration behind a low-pass
+#: does last; a robot that gains less than 0.4 m/s^2 loses more distance than slip is worth.
 OTHERS = {
     "std_max_ratio": 0.2,
     "launch_mps": 0.2,
@@ -97,7 +101,8 @@ OTHERS = {
     "lead_max_mps2": 0.8,
     "gain_least_mps2": 0.4,
     "fade_mps2": 0.7,
-    "rise_mps2": 1.0,
+    "rise_mps2": 0.7,
+    "step_mps": 0.1,
 }
 
 
@@ -294,12 +299,12 @@ def traction_step(
     elif state.desired_mps - desired > _BRAKE_MPS2 * dt_s or (state.braking_s > 0.0 and was > desired):
         drive_state = DriveState.BRAKING
     if status is not TractionStatus.OK:
-        driven = min(desired, was + settings.fade_mps2 * dt_s)
+        driven = min(desired, max(was + settings.fade_mps2 * dt_s, settings.step_mps))
     elif drive_state is DriveState.TRACTION:
         ahead = smooth + settings.lead_s * min(max(smooth_mps2, 0.0), settings.lead_max_mps2)
         cap = max(ahead, settings.launch_mps) / (1.0 - min(aimed, _FLOOR_MAX))
         rise_mps2 = settings.rise_mps2 if smooth > settings.launch_mps else settings.fade_mps2
-        driven = min(desired, max(was, min(cap, was + rise_mps2 * dt_s)))
+        driven = min(desired, max(was, min(cap, max(settings.step_mps, was + rise_mps2 * dt_s))))
         held_s = state.held_s + dt_s if driven < desired else 0.0
     elif drive_state is DriveState.BRAKING and target.braking_mps2 > 0.0:
         stops_in_s = state.braked_from_mps / max(target.braking_mps2, 1e-6)

@@ -178,6 +178,22 @@ def test_a_hard_start_on_slick_ground_slips_less(robot):
     assert limited[-1, 3] > 0.85 * plain[-1, 3]
 
 
+@pytest.mark.parametrize("name", ["husky", "omnirobot"])
+def test_a_start_on_hard_ground_slips_less_than_the_constant_rise_that_travels_as_far(name):
+    """Slip follows from the acceleration there: without the first step no other rise is better than a constant one."""
+
+    def start(controller, rise):
+        rows = drive(ROBOTS[name], ramped(0.6, 0.0, 0.0, accel=rise / 0.6), controller, mu=0.3, s_0=0.1)
+        return rows[rows[:, 1] > 0.2, 6].max(), rows[-1, 3]
+
+    limited, travelled_m = start("traction", 4.0)
+    low, high = 0.3, 4.0
+    for _ in range(8):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if start("plain", middle)[1] < travelled_m else (low, middle)
+    assert limited < 0.9 * start("plain", low)[0]
+
+
 @every_drive
 def test_where_no_slip_is_known_the_robot_is_driven_and_nothing_corrected(robot):
     pilot, command = control(robot), None
