@@ -55,7 +55,7 @@ from terrain.control.traction import (
     traction_step,
 )
 from terrain.control.turning import SETTINGS as TURN
-from terrain.control.turning import first_state, turn_step, turning_of
+from terrain.control.turning import first_state, open_loop, turn_step, turning_of
 from terrain.errors import ConfigError
 from terrain.estimation.clocks import check_channels
 from terrain.estimation.health import SENSORS, SLIP_SENSORS, SOUND, Health
@@ -531,7 +531,8 @@ class RobotControl:
         if seen is not None and sound:
             speed_mps = seen.speed_x_mps if seen.reference_age_s < FRESH_S else math.nan
             given = *given[:2], seen.yaw_rate_radps, seen.wheel_speed_mps, speed_mps, dt_s
-        twist, self._turn = turn_step(TURN, self._turning, self._turn, *given)
+        twist, turn = turn_step(TURN, self._turning, self._turn, *given)
+        self._turn = turn if self._settings.follows else open_loop(turn)
         return twist
 
     def _to_wheels(self, twist: Array, dt_s: float) -> tuple[Array, Array]:

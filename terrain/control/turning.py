@@ -18,6 +18,7 @@ controller drives the part p, behind the lag of the robot, and the measured one 
 - A turn can take more than the ground or the motors give: the robot slips by more than a bound, and more speed of its
   wheels gives hardly more thrust, or a wheel stays behind its command.  It would cost the robot its speed: x and the
   integral fall then, towards the turn that the wheels' speeds give by themselves.
+- Where another controller drives, as a log is replayed, the error is none of these commands': nothing is integrated.
 - Without a yaw rate nothing is corrected, and x stays.
 """
 
@@ -101,6 +102,11 @@ def first_state(robot: Robot) -> TurnState:
     return TurnState(robot.identified.get("effective_track_m", robot.track_m) / robot.track_m)
 
 
+def open_loop(state: TurnState) -> TurnState:
+    """Return a state whose commands were not driven by: none of the error was left by them, and no wheel is behind."""
+    return state._replace(integral_radps=0.0, commanded_mps=None)
+
+
 def turn_step(
     settings: TurnSettings,
     turning: Turning,
@@ -170,7 +176,7 @@ def turn_step(
         asked = settings.k_p * error + grown
         added = min(max(asked, -least), most)
         bounded = (
-            spins or asked != added or fastest + float(np.abs(arms).max()) * abs(added) > turning.limit_mps
+            strained or asked != added or fastest + float(np.abs(arms).max()) * abs(added) > turning.limit_mps
         )
         if not (bounded and asked * error > 0.0):
             integral = grown

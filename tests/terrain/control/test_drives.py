@@ -9,6 +9,7 @@ from terrain.control.path_tracking import check_tracking, tracking_of
 from terrain.control.robot_control import PilotSettings, RobotControl, check_pilot
 from terrain.control.slip_table import load_slip_table
 from terrain.control.switching import OutputStatus, TerrainBelief
+from terrain.control.turning import SETTINGS as TURN
 from terrain.errors import ConfigError
 from terrain.estimation.live import LiveEstimate
 from terrain.records import Reading
@@ -130,10 +131,12 @@ every_drive = pytest.mark.parametrize("robot", ROBOTS.values(), ids=list(ROBOTS)
 turning_by_wheels = pytest.mark.parametrize("name", ["husky", "marmotte", "omnirobot"])
 
 
-def control(robot, controller="traction", track=False):
+def control(robot, controller="traction", track=False, follows=True):
     channels = {"wheels": robot.rate_channels}
     states = () if controller in ("plain", "ramp") else STATES
-    return RobotControl(robot, load_slip_table(), PilotSettings(controller, track=track), states, channels)
+    return RobotControl(
+        robot, load_slip_table(), PilotSettings(controller, track=track, follows=follows), states, channels
+    )
 
 
 def drive(robot, twist, controller="traction", length_s=8.0, track=False, push=None, **ground):
@@ -229,6 +232,23 @@ def test_the_commanded_turn_is_kept_while_a_side_slips_more(name, twist):
     most = max(0.05 * abs(twist[2]), 0.01)
     assert np.abs(kept[late, 2] - twist[2]).max() < most
     assert abs(plain[-1, 2] - twist[2]) > 1.4 * abs(kept[-1, 2] - twist[2])
+
+
+@turning_by_wheels
+def test_a_replayed_log_winds_nothing_up(name):
+    """Another controller drives: what is left of its turn is no error of these commands."""
+    robot, twist = ROBOTS[name], np.array([0.4, 0.0, 0.4])
+    plant, driver = RollingRobot(robot, **SLICK), control(robot, "plain")
+    replayed = control(robot, follows=False)
+    for _ in range(500):
+        seen = plant.estimate()
+        now = plant.time_s, DT_S, twist
+        plant.step(driver.step(*now, None, BELIEF, OutputStatus.NONE, holds=True)[0])
+        command, _ = replayed.step(*now, seen, BELIEF, OutputStatus.NONE, holds=True)
+    rolled = float(np.linalg.pinv(replayed._turning.rolling)[2] @ plant.wheel_mps)
+    ratio = rolled / plant.motion[2] if robot.skids else 1.0
+    answer = ratio * (twist[2] + TURN.k_p * (twist[2] - plant.motion[2]))
+    assert command.twist[2] / command.twist[0] == pytest.approx(answer / twist[0], rel=0.05)
 
 
 @turning_by_wheels

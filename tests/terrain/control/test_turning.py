@@ -102,3 +102,11 @@ def test_where_the_robot_is_slow_beside_its_wheels_its_turn_takes_no_more():
     assert grips.track_ratio > 2.5
     on_the_spot = steps((0.0, 0.0, 0.6), 0.1, 50, state=state, wheels=(-0.5, 0.5), speed=0.0)[1]
     assert on_the_spot.track_ratio > 2.5
+
+
+def test_wheels_that_stay_behind_their_commands_wind_nothing_up():
+    twist, turning = (0.5, 0.0, 0.3), turning_of(load_robot("robotino"))
+    rolling = turning.rolling @ twist
+    _, state = steps(twist, 0.3, 100, wheels=rolling, turning=turning)
+    _, state = steps(twist, 0.2, 200, state=state, wheels=0.6 * rolling, turning=turning)
+    assert abs(state.integral_radps) < 0.01
