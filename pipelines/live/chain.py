@@ -117,6 +117,11 @@ class Chain:
         self.table = table
 
     @property
+    def is_estimated(self) -> bool:
+        """Whether a filter estimates the motion."""
+        return self._filter is not None
+
+    @property
     def target_ratio(self) -> float:
         """Target slip in traction of the terrain that is believed."""
         return self.table.lookup(self.belief.terrain)["traction"].slip_ratio

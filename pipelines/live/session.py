@@ -29,6 +29,7 @@ from terrain.control.slip_table import SlipTable
 from terrain.discrepancy.watch import FALSE_ALARM_H, Watch, Watched
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.clocks import Inbox, SessionClock, numbers
+from terrain.estimation.health import LOST_AFTER_S
 from terrain.records import Sample
 from terrain.robots import Robot
 
@@ -47,6 +48,7 @@ SEEN = ("slip_ratio", "slip_std", "wheel_speed_mps", "current_a", *MOTION)
 """What an observation has of the estimate of a motion."""
 
 NOT_ESTIMATED = "no filter runs: the model of the terrain takes none, and no robot is described or driven"
+NO_SAMPLE, NO_WHEELS = "no sample of the wheels has come yet", "no speed of a wheel comes"
 NOT_FOLLOWED = (
     "the wheels do not do what is commanded, and are left out (follows: false if another controller drives)"
 )
@@ -360,7 +362,12 @@ class RobotSession:
             )
             for name, channel in (("wheel_speed_mps", "speed_{}_mps"), ("current_a", "current_{}_a")):
                 known[name] = self.inbox.last("wheels", [channel.format(wheel) for wheel in self._wheels])
-        reason = seen.reason if seen is not None else NOT_ESTIMATED
+        reason = seen.reason if seen is not None else NO_SAMPLE if self.chain.is_estimated else NOT_ESTIMATED
+        if (
+            seen is not None and time_s - seen.time_s > LOST_AFTER_S
+        ):  # estimates are those of the wheels' samples
+            known |= {name: np.full(len(self._wheels), math.nan) for name in SEEN[:3]}
+            reason = NO_WHEELS
         if reason and isinstance(self.chain, LivePilot) and self.chain.control.not_followed:
             reason = NOT_FOLLOWED
         sensors = self.chain.health or self.inbox.health(time_s)

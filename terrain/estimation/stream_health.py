@@ -148,6 +148,11 @@ class StreamHealth:
     ) -> list[int]:
         """Take what arrived at a step, and the estimate before it; return the health of each sensor."""
         age_s, moves = 0.0, False
+        if (
+            motion is not None and now_s - motion.time_s > LOST_AFTER_S
+        ):  # it waits for the wheels, and shows nothing
+            self._gained.clear()
+            motion = None
         if motion is not None:
             age_s = motion.reference_age_s + max(now_s - motion.time_s, 0.0)
             fastest_mps = float(np.nan_to_num(np.abs(motion.wheel_speed_mps)).max())

@@ -11,10 +11,17 @@ import pytest
 
 from pipelines.learn.model_file import write_model
 from pipelines.learn.training_data import fitted_model
+from pipelines.live.pilot import LivePilot
+from pipelines.live.session import NO_WHEELS
 from pipelines.serve.serve import Settings
 from pipelines.serve.service import Service
+from terrain.control.robot_control import PilotSettings
+from terrain.control.situations import make_situation, simulate_situation
 from terrain.logs.run_folders import write_run
 from terrain.records import RunLog, Stream
+from terrain.robots import load_robot
+from terrain.simulation.assumed import with_assumed
+from terrain.simulation.faults import FaultyBus, fault_catalogue
 
 IMU = tuple(
     f"{quantity}_{axis}_{unit}" for quantity, unit in (("gyro", "radps"), ("accel", "mps2")) for axis in "xyz"
@@ -54,18 +61,74 @@ def example(name):
     return module
 
 
-def test_a_robots_program_gets_its_terrain(runs, model_folder, tmp_path, capsys):
+@pytest.fixture(scope="module")
+def url(model_folder):
+    """The address of a service."""
     service, ready = Service(Settings(model=str(model_folder), port=0)), threading.Event()
     thread = threading.Thread(target=service.run, args=(lambda url: ready.set(),))
     thread.start()
     try:
         assert ready.wait(30.0)
-        folder = write_run(runs[4], tmp_path)
-        assert example("live_robot").drive(str(folder), service.url.replace("http", "ws"), speed=6.0) == "b"
+        yield service.url.replace("http", "ws")
     finally:
         service.stop()
         thread.join(30.0)
+
+
+def test_a_robots_program_gets_its_terrain(runs, url, tmp_path, capsys):
+    folder = write_run(runs[4], tmp_path)
+    assert example("live_robot").drive(str(folder), url, speed=6.0) == "b"
     assert "b" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("by_twist", [False, True])
+def test_a_robot_drives_by_the_served_commands_and_slips_less_than_by_plain_ones(url, by_twist):
+    moving, robot = example("moving_robot"), with_assumed(load_robot("husky"))
+    log, answers = moving.drive("husky", "grass", url, by_twist=by_twist, real_time=False, seed=80000)
+    made = make_situation("starts", robot, "grass", 80000)
+    pilot = LivePilot(robot, settings=PilotSettings("plain"))
+    plain = simulate_situation(robot, made, pilot.step, moving.DELAY_S)
+    assert {answer["command"]["status"] for answer in answers} == {"ok"}
+    assert answers[-1]["observation"]["slip_unknown"] == "the wheels stand"
+    assert moving.largest_slip(log) < 0.9 * moving.largest_slip(plain)
+    reached_m, plain_m = (run.streams["truth"].channel("position_x_m")[-1] for run in (log, plain))
+    assert reached_m > 0.9 * plain_m
+
+
+@pytest.mark.parametrize(
+    ("fault", "named"),
+    [
+        ("loss_gnss", {"gnss_position": "lost", "gnss_speed": "lost"}),
+        ("loss_imu", {"gyro": "lost", "accel": "lost", "tilt": "lost"}),
+        ("loss_wheels", {"wheel_left": "lost", "wheel_right": "lost"}),
+        ("freeze_speed_left", {"wheel_left": "frozen"}),
+    ],
+)
+@pytest.mark.parametrize("start_s", [10.0, 13.0])  # before a start, and in motion
+def test_a_sensor_that_is_lost_on_a_driven_robot_is_named_it_alone_and_the_robot_drives_on(
+    url, fault, named, start_s
+):
+    lost = fault_catalogue(with_assumed(load_robot("husky")))[fault]
+    log, answers = example("moving_robot").drive(
+        "husky",
+        "grass",
+        url,
+        real_time=False,
+        seed=80000,
+        bus=lambda controller: FaultyBus(controller, lost, start_s, start_s + 3.5, 0),
+    )
+    seen = {round(answer["time_s"], 2): answer["observation"] for answer in answers if answer["time_s"]}
+    for time_s in (start_s + 2.0, start_s + 3.0):
+        given = seen[time_s]
+        assert {name: health for name, health in given["sensors"].items() if health != "fresh"} == named
+        if fault == "loss_wheels":
+            assert (given["slip_unknown"], given["slip_ratio"]) == (NO_WHEELS, [None, None])
+    truth = log.streams["truth"]
+    drives = (truth.time_s > 14.0) & (truth.time_s < 16.0)
+    assert truth.channel("speed_x_mps")[drives].min() > 0.5
+    assert answers[-1]["command"]["traction"] == "ok"
+    assert set(seen[24.0]["sensors"].values()) == {"fresh"}
+    assert None not in seen[24.0]["slip_ratio"]
 
 
 class Publisher:

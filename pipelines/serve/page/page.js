@@ -150,11 +150,14 @@
     });
   }
   function showAnswer(message, seen, command) {
-    const target = seen.target_slip.traction, healths = Object.values(seen.sensors), n = healths.filter((one) => one !== "fresh").length;
+    const target = seen.target_slip.traction, sensors = Object.entries(seen.sensors), unsound = {};
+    for (const [name, health] of sensors) if (health !== "fresh") (unsound[health] ||= []).push(name.replaceAll("_", " "));
+    const groups = Object.entries(unsound).map(([health, names]) => (names.length === sensors.length ? "all sensors" : names.join(", ")) + " " + health);
+    const traction = !command || command.status !== "ok" || command.traction === "ok" ? "" : ", slip not controlled (" + command.traction + ")";
     text("answer", [
       target ? "Target slip " + signed(target.slip_ratio, 3) + " in traction" + (target.status === "estimated" ? "" : ", " + target.status) : "No target slip",
-      ...(command ? [command.status === "ok" ? "command ok" : "command " + command.status] : []),
-      n ? n + " of " + healths.length + " sensors not fresh" : "all sensors fresh",
+      ...(command ? ["command " + command.status + traction] : []),
+      ...(groups.length ? groups : ["all sensors fresh"]),
       ...message.trouble.slice(0, 1),
     ].join("; ") + ".");
   }

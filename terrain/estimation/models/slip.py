@@ -842,9 +842,8 @@ class SlipFilter(FilterObserver):
             return "no speed of a wheel comes, or no angle of a steered one"
         if np.nanmax(fastest_mps) < MIN_SPEED_MPS:
             return "the wheels stand"
-        return (
-            f"it is uncertain by more than {UNKNOWN_RATIO:g}, {age_s:.1f} s after the last speed over ground"
-        )
+        after = f", {age_s:.0f} s after the last speed over ground" if age_s >= 1.0 else ""
+        return f"it is uncertain by more than {UNKNOWN_RATIO:g}{after}"
 
 
 def _or_zero(values: Any) -> Any:

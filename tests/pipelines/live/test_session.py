@@ -10,7 +10,7 @@ from pipelines.live.chain import CommandStatus
 from pipelines.live.classifying import Classifier
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
-from pipelines.live.session import NOT_FOLLOWED, TWIST_FRESH_S, Hello, RobotSession, Served
+from pipelines.live.session import NO_SAMPLE, NOT_FOLLOWED, TWIST_FRESH_S, Hello, RobotSession, Served
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live import CHANNELS
@@ -167,6 +167,10 @@ def test_wheels_that_do_not_do_what_is_commanded_are_the_reason_of_an_unknown_sl
         session.put(rows, [0.1, 0.0, 0.0], NOW_S + time_s)
         step = session.step(NOW_S + time_s)
     assert (step.observation["slip_unknown"] == NOT_FOLLOWED) == follows
+
+
+def test_before_the_first_sample_a_driven_robot_is_not_said_to_have_no_filter():
+    assert agrimaro().step(NOW_S).observation["slip_unknown"] == NO_SAMPLE
 
 
 @pytest.mark.parametrize("fault", ["raises", {"wheel_radps": math.nan}, {"steer_rad": math.inf}])
