@@ -319,6 +319,7 @@ def samples_of(
     if not any((each != each[:1, :, :1]).any() for each in values.values()):
         streams = " and ".join(repr(name) for name in values)
         raise DataError(f"no channel of the streams {streams} ever varies: nothing can be learned from them")
+    repaired = dict(Counter(repaired) + Counter(cut.filled))
     return Samples(cut.windows, cut.dropped, group, gap, merged, distinct, repaired)
 
 

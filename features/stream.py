@@ -21,13 +21,17 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from features.windows import (
+    INTERPOLATED,
     MAX_GAP_PERIODS,
     TIME_TOLERANCE_S,
     Layout,
     WindowRule,
     at_rates,
     cut_at,
+    lost_times,
+    max_missing,
     wheel_speeds,
+    with_lost,
 )
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.clocks import readable
@@ -82,6 +86,7 @@ class WindowStream:
     ----------
     dropped : windows dropped so far, by reason (:data:`~features.windows.DROP_REASONS`)
     dropped_samples : samples dropped so far, by stream and reason
+    filled : values that were missing and are interpolated in the windows
 
     Examples
     --------
@@ -106,6 +111,7 @@ class WindowStream:
         self.layout = layout
         self.dropped: Counter[str] = Counter()
         self.dropped_samples: Counter[tuple[str, str]] = Counter()
+        self.filled = 0
         self._own, self._judged, self._refused = layout, not layout.least_hz, ""
         for name in layout.channels:  # too few are refused now and not at the first window
             layout.n_samples(name, rule.length_s)
@@ -147,6 +153,11 @@ class WindowStream:
             for name in own.channels:
                 own.n_samples(name, self.rule.length_s)
             self._own = own
+            for name, buffer in self._buffers.items():
+                if buffer.time_s:
+                    samples = np.array(buffer.time_s), np.array(buffer.values)
+                    time_s, values = with_lost(*samples, 1 / own.rate_hz[name], self._most(name))
+                    buffer.time_s, buffer.values = time_s.tolist(), list(values)
         except DataError as error:
             self._refused = str(error)
 
@@ -199,8 +210,11 @@ class WindowStream:
                 self._set_due()
         return self._advance() if time_s >= self._due_s[stream] else []
 
+    def _most(self, stream: str) -> int:
+        return max_missing(self._own.n_samples(stream, self.rule.length_s))
+
     def _append(self, stream: str, buffer: _Buffer, time_s: float, values: Sequence[float] | Array) -> None:
-        if len(buffer.time_s) == buffer.capacity:
+        if len(buffer.time_s) >= buffer.capacity:
             # remove what no window needs any more, and the oldest samples where that is not enough
             needed_from_s = self._start_s + self.rule.step_s * self._next
             if math.isnan(self._start_s):
@@ -211,6 +225,11 @@ class WindowStream:
                 self.dropped_samples[stream, "faster than its rate"] += enough - n
                 n = enough
             del buffer.time_s[:n], buffer.values[:n]
+        if self._judged and time_s - buffer.last_s > MAX_GAP_PERIODS / self._own.rate_hz[stream]:
+            period_s, most = 1 / self._own.rate_hz[stream], self._most(stream)
+            for lost_s in lost_times(buffer.last_s, time_s, period_s, most):
+                buffer.values.append(np.full(buffer.n_channels, np.nan))
+                buffer.time_s.append(lost_s)
         buffer.values.append(np.array(values, dtype=float))
         buffer.time_s.append(time_s)
         buffer.last_s = time_s
@@ -252,11 +271,12 @@ class WindowStream:
                     streams[name] = Stream(*samples, channels[name])
             if len(streams) == len(channels):
                 at = np.array([start_s])
-                values, (reason,) = cut_at(streams, at, rule, self._own)
+                values, (reason,), (filled,) = cut_at(streams, at, rule, self._own)
                 self._next += 1
                 if reason:
                     self.dropped[str(reason)] += 1
                 else:
+                    self.filled += int(filled)
                     run_id, unknown = (np.array([name], dtype=object) for name in ("live", ""))
                     values = at_rates(values, self._own, self.layout, rule.length_s)
                     of_layout = channels, self.layout.rate_hz, rule.length_s
@@ -337,12 +357,18 @@ class WindowFeed:
         """Windows and samples that were not used, as counts by kind."""
         counts = {f"window: {reason}": n for reason, n in self._stream.dropped.items()}
         counts |= {f"{name}: {why}": n for (name, why), n in self._stream.dropped_samples.items()}
+        counts |= self.filled
         return counts | {f"{name}: unreadable": n for name, n in self.unreadable.items()}
 
     @property
     def resampled(self) -> tuple[str, ...]:
         """In a sentence, each stream whose windows are resampled."""
         return self._stream.resampled
+
+    @property
+    def filled(self) -> dict[str, int]:
+        """Number of values that were missing and are interpolated, as of :class:`~features.windows.WindowCut`."""
+        return {INTERPOLATED: self._stream.filled} if self._stream.filled else {}
 
     @property
     def due_s(self) -> float:

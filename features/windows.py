@@ -2,9 +2,10 @@
 
 A window of length ``L`` that starts at ``t0`` holds, of each stream, the first ``floor(L rate)`` samples
 at or after ``t0``.  Each stream keeps its own rate, and a window holds the samples as they were measured, but where a
-model takes windows of another rate than a log's: these are cut at the log's rate and resampled one by one
-(:func:`at_rates`).  :func:`cut_at` is the one place where samples are cut; whole logs, the papers'
-partitions and the sample-by-sample form of :mod:`features.stream` all go through it.
+few are missing, lost or NaN, which are interpolated (:func:`max_missing`), and where a model takes windows of another
+rate than a log's: these are cut at the log's rate and resampled one by one (:func:`at_rates`).  :func:`cut_at` is the
+one place where samples are cut; whole logs, the papers' partitions and the sample-by-sample form of
+:mod:`features.stream` all go through it.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from functools import lru_cache
 import numpy as np
 
 from terrain.errors import ConfigError, DataError
-from terrain.logs.samples import refuse_implausible, usable_rows
+from terrain.logs.samples import refuse_implausible, usable
 from terrain.logs.schema import SIGNAL_SETS, signal_set_of
 from terrain.logs.schema import TIME_TOLERANCE_S as TIME_TOLERANCE_S
 from terrain.records import WINDOW_COLUMNS, Array, RunLog, Stream, Windows
@@ -38,6 +39,46 @@ SPAN_TOLERANCE = 0.1
 #: A longer step between two samples, in sample periods, is a gap: lets jitter through and catches one lost sample.
 MAX_GAP_PERIODS = 1.8
 DROP_REASONS = ("gap", "wrong rate", "not finite", "not moving", "not steady")
+INTERPOLATED = "missing values interpolated"
+
+
+def max_missing(n_samples: int) -> int:
+    """Return how many of the samples of a window may miss in a channel, and are interpolated: ``sqrt(n) / 2``.
+
+    White noise that is interpolated in single places has half of its variance there, so that of m missing ones of n
+    its deviation falls by m / 4n, for so few by less than a fifth of what it scatters by chance, ``1 / sqrt(2 n)``.
+
+    Examples
+    --------
+    >>> [max_missing(n) for n in (13, 100, 200)]
+    [1, 5, 7]
+    """
+    return int(0.5 * np.sqrt(n_samples))
+
+
+def lost_times(before_s: float, after_s: float, period_s: float, most: int) -> list[float]:
+    """Return the times of samples that were lost between two; none where the step is no gap, or more were lost.
+
+    Examples
+    --------
+    >>> lost_times(1.0, 1.3, 0.1, 2), lost_times(1.0, 1.4, 0.1, 2), lost_times(1.0, 1.1, 0.1, 2)
+    ([1.1, 1.2], [], [])
+    """
+    step_s = after_s - before_s
+    if not MAX_GAP_PERIODS * period_s < step_s < (most + 1.5) * period_s:
+        return []
+    n = round(step_s / period_s)
+    return [before_s + step_s * i / n for i in range(1, n)]
+
+
+def with_lost(time_s: Array, values: Array, period_s: float, most: int) -> tuple[Array, Array]:
+    """Return samples with rows of NaN for those that were lost one by one, or few in a row."""
+    gaps = np.flatnonzero(np.diff(time_s) > MAX_GAP_PERIODS * period_s)
+    lost = [lost_times(*time_s[i : i + 2].tolist(), period_s, most) for i in gaps]
+    at = np.repeat(gaps + 1, [len(each) for each in lost])
+    if not len(at):
+        return time_s, values
+    return np.insert(time_s, at, np.concatenate(lost)), np.insert(values, at, np.nan, axis=0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +124,7 @@ class WindowCut:
     windows: Windows
     dropped: Mapping[str, int]
     resampled: Mapping[str, int] = field(default_factory=dict)  #: number of runs, by a sentence
+    filled: Mapping[str, int] = field(default_factory=dict)  #: number of values, as :data:`INTERPOLATED`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -270,16 +312,17 @@ def at_rates(values: Mapping[str, Array], own: Layout, layout: Layout, length_s:
 
 def cut_at(
     streams: Mapping[str, Stream], starts_s: Array, rule: WindowRule, layout: Layout
-) -> tuple[dict[str, Array], Array]:
-    """Cut one run's streams at the starts (k,) of windows; the stride of the rule is not used.
+) -> tuple[dict[str, Array], Array, Array]:
+    """Cut one run's streams, with rows of what was lost, at the starts (k,) of windows; the rule's stride is not used.
 
     Returns
     -------
     values : per stream ``(k, channels, samples)``; rows of windows that are not kept hold anything
     reason : (k,) of str: ``""`` where the window is kept, a :data:`DROP_REASONS` where it is dropped,
         ``"incomplete"`` where a stream ends before the window does
+    filled : (k,) number of values that were missing and are interpolated
     """
-    reason = np.full(len(starts_s), "", dtype="<U10")
+    reason, filled = np.full(len(starts_s), "", dtype="<U10"), np.zeros(len(starts_s), dtype=int)
     values: dict[str, Array] = {}
     for name, channels in layout.channels.items():
         stream = streams[name]
@@ -295,19 +338,25 @@ def cut_at(
             continue
         samples = stream.values[:, [stream.channels.index(channel) for channel in channels]]
         gaps_before = np.concatenate(([0], np.cumsum(np.diff(stream.time_s) > limit_s)))
-        bad = ~usable_rows(samples, unknown_is_a_value=name in NAN_TOLERANT_STREAMS)
-        bad_before = np.concatenate(([0], np.cumsum(bad)))
+        known = usable(samples, unknown_is_a_value=name in NAN_TOLERANT_STREAMS)
+        missing_before = np.concatenate((np.zeros((1, len(channels)), dtype=int), np.cumsum(~known, axis=0)))
         first_s, last_s = stream.time_s[first], stream.time_s[first + n - 1]
         has_gap = (gaps_before[first + n - 1] > gaps_before[first]) | (first_s - starts_s > limit_s)
         off_rate = (
             np.abs(last_s - first_s - (n - 1) * period_s) > SPAN_TOLERANCE * (n - 1) * period_s + period_s
         )
-        not_finite = bad_before[first + n] > bad_before[first]
+        missing = missing_before[first + n] - missing_before[first]
+        not_finite = (missing > max_missing(n)).any(axis=1)
         for why, faulty in (("gap", has_gap), ("wrong rate", off_rate), ("not finite", not_finite)):
             reason[(reason == "") & faulty] = why
         reason[~complete] = "incomplete"
         # Contiguous, so that numpy adds one window's samples in the same order as those of many.
         values[name] = np.ascontiguousarray(samples[first[:, None] + np.arange(n)].transpose(0, 2, 1))
+        for i, c in np.argwhere((missing > 0) & (reason == "")[:, None]):
+            there = known[first[i] : first[i] + n, c]
+            at = np.arange(n)
+            values[name][i, c, ~there] = np.interp(at[~there], at[there], values[name][i, c, there])
+        filled += missing.sum(axis=1)
     if rule.steady is not None:
         candidate = reason == ""
         speeds = np.ascontiguousarray(wheel_speeds(values, layout.channels)[candidate])
@@ -316,7 +365,7 @@ def cut_at(
         moving = np.abs(speeds).mean(axis=2).max(axis=1) >= rule.steady.min_speed_mps
         even = np.abs(after - before).max(axis=1) <= rule.steady.max_accel_mps2 * rule.length_s / 2
         reason[candidate] = np.where(moving, np.where(even, "", "not steady"), "not moving")
-    return values, reason
+    return values, reason, filled
 
 
 def label_windows(run: RunLog, starts_s: Array, length_s: float) -> Array:
@@ -413,7 +462,7 @@ def cut_windows(
     n_samples = {name: layout.n_samples(name, rule.length_s) for name in layout.channels}
     nothing = {name: np.empty((0, len(names), n_samples[name])) for name, names in layout.channels.items()}
     parts = [windows(nothing, np.empty(0), "", np.empty(0, dtype=object), "")]
-    dropped, changed = Counter[str](), Counter[str]()
+    dropped, changed, filled = Counter[str](), Counter[str](), 0
     for run, own in zip(runs, own_layouts, strict=True):
         refuse_implausible(run, layout.channels)
         if not holds_a_window(run, own, rule.length_s, skip_short=skip_short):
@@ -423,13 +472,21 @@ def cut_windows(
             at = regular_starts(*span_of(run, own), rule.length_s, rule.step_s)
         else:
             at = np.asarray(starts_s.get(run.run_id, ()), dtype=float)
-        values, reason = cut_at(run.streams, at, rule, own)
+        streams = {}
+        for name, channels in layout.channels.items():
+            stream, most = run.streams[name], max_missing(own.n_samples(name, rule.length_s))
+            complete = with_lost(stream.time_s, stream.columns(channels), 1 / own.rate_hz[name], most)
+            streams[name] = Stream(*complete, channels)
+        values, reason, interpolated = cut_at(streams, at, rule, own)
+        filled += int(interpolated[reason == ""].sum())
         changed.update(layout.resampled_from(own))
         dropped.update(str(why) for why in reason if why not in ("", "incomplete"))
         kept, at = {name: array[reason == ""] for name, array in values.items()}, at[reason == ""]
         kept = at_rates(kept, own, layout, rule.length_s)
         parts.append(windows(kept, at, run.run_id, label_windows(run, at, rule.length_s), run.session))
-    return WindowCut(join_windows(parts), dict(dropped), dict(changed))
+    return WindowCut(
+        join_windows(parts), dict(dropped), dict(changed), {INTERPOLATED: filled} if filled else {}
+    )
 
 
 def join_windows(parts: Sequence[Windows]) -> Windows:

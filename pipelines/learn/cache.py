@@ -234,7 +234,7 @@ def _store_run(
     answers = np.column_stack([observed.response, observed.driving.reshape(len(windows), -1)])
     _write(
         file,
-        {"dropped": dict(cut.dropped), "quantities": observed.quantities},
+        {"dropped": dict(cut.dropped), "filled": dict(cut.filled), "quantities": observed.quantities},
         start_s=windows.start_s,
         terrain=windows.terrain,
         features=extractor.transform(windows).astype(np.float64),
@@ -248,11 +248,13 @@ def _table(
 ) -> tuple[Samples, Array, Motion]:
     """Return the labelled windows of all runs, run by run and in order of time, their features and motion."""
     parts, dropped, quantities = [], Counter[str](), ()
+    repaired = sum((Counter(head.repaired) for head in heads), Counter[str]())
     for head, file in zip(heads, files, strict=True):
         if (found := _read(file)) is None:
             raise LogError(f"{file}: was changed while it was used")
         about, columns = found
         dropped.update(about["dropped"])
+        repaired.update(about["filled"])
         quantities = tuple(about["quantities"])
         names = {"run_id": head.run_id, "session": head.session}
         n = len(columns["terrain"])
@@ -264,13 +266,12 @@ def _table(
     features = table["features"][known]
     if np.array_equal(features, np.broadcast_to(features[:1], features.shape), equal_nan=True):
         raise DataError("no feature ever varies: nothing can be learned from them")
-    repaired = dict(sum((Counter(head.repaired) for head in heads), Counter()))
     observed = None
     if quantities:
         answers, q = table["answers"][known], len(quantities)
         observed = Observed(quantities, answers[:, :q], answers[:, q:].reshape(len(answers), q, -1))
     parts_of = cut.windows, dict(cut.dropped), cut.windows.groups, rule.overlap
-    samples = Samples(*parts_of, repaired=repaired, cached=observed)
+    samples = Samples(*parts_of, repaired=dict(repaired), cached=observed)
     return samples, features, Motion(*(table[name][known] for name in Motion._fields))
 
 

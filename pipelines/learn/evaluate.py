@@ -370,4 +370,4 @@ def _notes(
     if samples.dropped:
         yield f"windows left out: {format_counts(samples.dropped)}"
     if samples.repaired:
-        yield f"changed or left out in reading the logs: {format_counts(samples.repaired)}"
+        yield f"changed or left out: {format_counts(samples.repaired)}"

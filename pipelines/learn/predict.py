@@ -132,7 +132,9 @@ class Predictions(Result):
     training_runs: tuple[str, ...] = described("runs that were in training")
     training_accuracy: float | None = described("as the accuracy, of those; it says nothing of others", "1")
     n_judged_training: int = described("windows of those whose label the model knows")
-    repaired: Mapping[str, int] = described("what a repairing reader dropped, by kind")
+    repaired: Mapping[str, int] = described(
+        "what a repairing reader dropped, and values that were interpolated, by kind"
+    )
     unknown_labels: Mapping[str, int] = described("windows by labels that the model was not trained on")
     n_unknown_labels: int = described("their number")
     dropped: Mapping[str, int] = described("windows left out, by reason")
@@ -294,7 +296,12 @@ def predict(
         training_runs=training,
         training_accuracy=_accuracy(trained),
         n_judged_training=len(trained),
-        repaired=dict(sum((Counter(each.dropped) for each in runs), Counter())),
+        repaired=dict(
+            sum(
+                (Counter(each) for each in (*(run.dropped for run in runs), *(cut.filled for cut in cuts))),
+                Counter(),
+            )
+        ),
         unknown_labels=dict(unknown),
         n_unknown_labels=unknown.total(),
         dropped=dict(sum((Counter(cut.dropped) for cut in cuts), Counter())),
@@ -481,7 +488,7 @@ def _notes(result: Predictions) -> list[Part]:
         },
         f"windows left out: {format_counts(result.dropped)}": result.dropped,
         f"of so many runs: {format_counts(result.resampled)}": result.resampled,
-        f"repaired: {format_counts(result.repaired)}": result.repaired,
+        f"changed or left out: {format_counts(result.repaired)}": result.repaired,
         **dict.fromkeys(result.skipped or (), True),
     }
     return [Text(text, "note") for text, applies in notes.items() if applies]

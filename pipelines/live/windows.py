@@ -162,7 +162,7 @@ def windows_of_log(
     reasons = {
         kind.removeprefix("window: "): n for kind, n in feed.dropped.items() if kind.startswith("window: ")
     }
-    return WindowCut(labelled, Counter(reasons), Counter(feed.resampled))
+    return WindowCut(labelled, Counter(reasons), Counter(feed.resampled), feed.filled)
 
 
 def prior_of(info: ModelInfo) -> Array:

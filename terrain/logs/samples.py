@@ -51,18 +51,16 @@ def refuse_or_count(repairs: Counter[str] | None, kind: str, sentence: str, n: i
     repairs[kind] += n
 
 
-def usable_rows(samples: Array, *, unknown_is_a_value: bool = False) -> Array:
-    """Return which rows (n,) of samples (n, c) in SI units hold plausible values only; NaN, if stated, is one.
+def usable(samples: Array, *, unknown_is_a_value: bool = False) -> Array:
+    """Return which samples in SI units are plausible values; NaN, if stated, is one.
 
     Examples
     --------
-    >>> usable_rows(np.array([[1.0, -2.0], [1.0, np.nan], [np.inf, 0.0], [1e200, 0.0]])).tolist()
-    [True, False, False, False]
+    >>> usable(np.array([1.0, -2.0, np.nan, np.inf, 1e200])).tolist()
+    [True, True, False, False, False]
     """
-    usable = np.abs(samples) <= MAX_MAGNITUDE  # NaN is not
-    if unknown_is_a_value:
-        usable |= np.isnan(samples)
-    return np.asarray(usable.all(axis=1))
+    is_value = np.abs(samples) <= MAX_MAGNITUDE  # NaN is not
+    return np.asarray(is_value | np.isnan(samples) if unknown_is_a_value else is_value)
 
 
 def refuse_implausible(run: RunLog, channels: Mapping[str, Sequence[str]]) -> None:

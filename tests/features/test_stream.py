@@ -56,7 +56,8 @@ def logs(draw):
         if name == "wheels":
             values[:, :2] = 0.4 + 0.05 * values[:, :2] + draw(st.floats(0.0, 0.4)) * np.sin(time_s)[:, None]
         for _ in range(draw(st.integers(0, 3))):
-            at, length = rng.integers(n), rng.integers(1, max(2, int(0.8 / period_s)))
+            at = rng.integers(n)
+            length = rng.integers(1, max(2, int(draw(st.sampled_from([0.1, 0.8])) / period_s)))
             if rng.random() < 0.5:
                 values[at : at + length, 0] = rng.choice([np.nan, np.inf])
             elif n - length > 2:
@@ -89,6 +90,7 @@ def test_sample_by_sample_gives_the_very_windows_and_drops_of_the_whole_log(case
     counted.pop("run too short", None)
     assert dict(stream.dropped) == counted
     assert not stream.dropped_samples
+    assert stream.filled == sum(batch.filled.values())
 
 
 def steady_log(duration_s=20.0, imu_hz=50.0, wheels_hz=10.0):

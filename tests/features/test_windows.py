@@ -4,6 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from features.windows import (
+    INTERPOLATED,
     RATE_SLACK,
     SteadyMotion,
     WindowRule,
@@ -11,6 +12,7 @@ from features.windows import (
     cut_windows,
     label_windows,
     layout_of,
+    max_missing,
 )
 from terrain.errors import ConfigError, DataError
 from terrain.records import Label, RunLog, Stream
@@ -65,12 +67,12 @@ def test_a_window_holds_the_first_samples_at_or_after_its_start(length_s, stride
 def test_a_fault_drops_the_windows_that_it_touches_and_no_other():
     run = make_run()
     for stream, rows, values, reason in (
-        ("imu", [120], None, "gap"),
-        ("imu", [100, 101], None, "gap"),  # at the very start of the window
-        ("imu", [199], None, "gap"),  # between the last two samples
+        ("imu", slice(120, 126), None, "gap"),
+        ("imu", slice(100, 106), None, "gap"),  # at the very start of the window
         ("imu", slice(120, 170), None, "gap"),
-        ("imu", [199], np.nan, "not finite"),
-        ("wheels", [20], np.inf, "not finite"),
+        ("imu", slice(120, 200, 10), None, "not finite"),  # eight that were lost one by one
+        ("imu", slice(194, 200), np.nan, "not finite"),
+        ("wheels", [20, 24, 30], np.inf, "not finite"),
         ("wheels", slice(20, 40), 0.0, "not moving"),
         ("wheels", slice(20, 30), 0.5, "not steady"),
     ):
@@ -80,6 +82,41 @@ def test_a_fault_drops_the_windows_that_it_touches_and_no_other():
     unknown = cut_windows([make_run(slip=slip)]).windows.values["slip"]  # a value, which drops nothing
     assert len(unknown) == 4
     assert np.isnan(unknown).all()
+
+
+def test_few_missing_samples_are_interpolated_and_counted_and_no_window_is_lost():
+    """Values are the number of their sample, which a line between its neighbours has, too, but not at the ends."""
+    run = make_run()
+    whole = cut_windows([run])
+    for rows, values, n in (
+        ([120], None, 1),
+        ([120], np.nan, 1),
+        (slice(120, 125), None, 5),
+        (slice(120, 125), np.nan, 5),
+        ([105, 150, 220], np.nan, 3),
+        ([105, 150, 220], None, 3),
+    ):
+        cut = cut_windows([make_run(imu=replaced(run.streams["imu"], rows, values))])
+        assert (len(cut.windows), cut.dropped, cut.filled) == (4, {}, {INTERPOLATED: n})
+        np.testing.assert_allclose(cut.windows.values["imu"], whole.windows.values["imu"], rtol=1e-12)
+    cut = cut_windows([make_run(imu=replaced(run.streams["imu"], [100, 399], np.nan))])
+    assert cut.windows.values["imu"][1, 0, :2].tolist() == [101.0, 101.0]
+    assert cut.windows.values["imu"][3, 0, -2:].tolist() == [398.0, 398.0]
+    assert whole.filled == {}
+
+
+def test_the_deviation_of_noise_falls_by_less_than_a_fifth_of_its_scatter_where_samples_are_missing():
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((2000, 100))
+    time_s = np.arange(noise.size) / 50
+    values = noise.ravel().copy()
+    missing = rng.permuted(np.tile(np.arange(100) < max_missing(100), (2000, 1)), axis=1)
+    values[missing.ravel()] = np.nan
+    stream = Stream(time_s, values[:, None], ("accel_z_mps2",))
+    cut = cut_windows([RunLog("a", "husky", {"imu": stream})], WindowRule(steady=None))
+    assert cut.filled == {INTERPOLATED: 2000 * max_missing(100)}
+    found, whole = (each.std(axis=1) for each in (cut.windows.values["imu"][:, 0], noise))
+    assert -0.2 * whole.std() < np.mean(found - whole) < -0.1 * whole.std()
 
 
 def test_steady_motion_is_judged_on_means_of_the_faster_wheel():
@@ -132,8 +169,8 @@ def test_rules_that_mean_nothing_and_runs_that_do_not_fit_together_are_refused_b
     with pytest.raises(DataError, match=beyond):
         cut_windows([make_run(imu=replaced(imu, [150], 1e13))])
     # The live chain drops such a window and goes on.
-    live = make_run(imu=replaced(imu, [150], 1e200)).streams
-    _, reason = cut_at(live, np.arange(0.0, 8.0, 2.0), WindowRule(), layout_of([run]))
+    live = make_run(imu=replaced(imu, slice(150, 160), 1e200)).streams
+    _, reason, _ = cut_at(live, np.arange(0.0, 8.0, 2.0), WindowRule(), layout_of([run]))
     assert reason.tolist() == ["", "not finite", "", ""]
     with pytest.raises(DataError, match="there is no run"):
         layout_of([])
