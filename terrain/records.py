@@ -189,26 +189,34 @@ class StateTrack:
 
     time_s: Array  #: (n,) seconds
     mean: Array  #: (n, d) state after the measurements of that instant
-    cov: Array  #: (n, d, d) its covariance
+    cov: Array  #: (n, d, d) its covariance, or (n, d) the variances, where no more is known
     states: tuple[str, ...]  #: name of each state, ending in its unit
-    nis: Array  #: (n, k) squared innovation of each sensor over its covariance; NaN where it gave nothing
-    nis_dof: Array  #: (n, k) number of measurements in it
-    use: Array  #: (n, k) :data:`ABSENT`, :data:`USED`, :data:`GATED` or :data:`REOPENED`
-    sensors: tuple[str, ...]  #: name of each of the k sensors
-    #: (n,) time since a sensor of speed over ground was last used; infinite before the first
-    reference_age_s: Array
-    log_likelihood: float  #: of all measurements that were used
+    #: (n, k) squared innovation of each sensor over its covariance; NaN where it gave nothing
+    nis: Array = field(default_factory=partial(np.empty, (0, 0)))
+    nis_dof: Array = field(default_factory=partial(np.empty, (0, 0)))  #: (n, k) number of measurements in it
+    #: (n, k) :data:`ABSENT`, :data:`USED`, :data:`GATED` or :data:`REOPENED`
+    use: Array = field(default_factory=partial(np.empty, (0, 0)))
+    sensors: tuple[str, ...] = ()  #: name of each of the k sensors; none of a filter that does not tell
+    #: (n,) time since a sensor of speed over ground was last used, infinite before the first; NaN by default
+    reference_age_s: Array = field(default_factory=partial(np.empty, 0))
+    log_likelihood: float = float("nan")  #: of all measurements that were used
     #: measurements that the filter did not accept, as counts by kind
     dropped: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        n, d, k = len(self.time_s), len(self.states), len(self.sensors)
+        if not k:
+            for name in ("nis", "nis_dof", "use"):
+                object.__setattr__(self, name, np.empty((n, 0)))
+        if not len(self.reference_age_s):
+            object.__setattr__(self, "reference_age_s", np.full(n, np.nan))
         for name in ("time_s", "mean", "cov", "nis", "reference_age_s"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
         for name in ("nis_dof", "use"):
             object.__setattr__(self, name, read_only(getattr(self, name), np.int8))
         object.__setattr__(self, "dropped", MappingProxyType(dict(self.dropped)))
-        n, d, k = self.time_s.size, len(self.states), len(self.sensors)
-        shapes = {"mean": (n, d), "cov": (n, d, d), "nis": (n, k), "nis_dof": (n, k), "use": (n, k)}
+        shapes = {"mean": (n, d), "nis": (n, k), "nis_dof": (n, k), "use": (n, k)}
+        shapes["cov"] = (n, d) if self.cov.ndim == 2 else (n, d, d)
         for name, shape in (shapes | {"reference_age_s": (n,)}).items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}, {shape} is needed")
@@ -220,34 +228,49 @@ class StateTrack:
     def std(self, name: str) -> Array:
         """Return the standard deviation (n,) of one state."""
         i = self.states.index(name)
-        return np.sqrt(self.cov[:, i, i])
+        return np.sqrt(self.cov[:, i, i] if self.cov.ndim == 3 else self.cov[:, i])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlipTrack:
-    """Longitudinal slip of each wheel over time; NaN where it is undefined, never a silent 0."""
+    """Slip of wheels, tracks or axles over time; NaN where it is undefined, never a silent 0."""
 
     time_s: Array  #: (n,) seconds
-    slip_ratio: Array  #: (n, wheels), positive in traction
-    slip_std: Array  #: (n, wheels), one standard deviation
-    wheels: tuple[str, ...]  #: name of each wheel
+    mean: Array  #: (n, k) positive in traction
+    std: Array  #: (n, k) one standard deviation
+    #: name of each slip, with its unit: ``slip_<wheel>_ratio``, or of a slip angle ``slip_<axle>_rad``
+    channels: tuple[str, ...]
     #: (n,) true where the speed over ground was not measured lately; never by default
     stale: Array = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def __post_init__(self) -> None:
-        for name in ("time_s", "slip_ratio", "slip_std"):
+        for name in ("time_s", "mean", "std"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
         stale = self.stale if len(self.stale) else np.zeros(self.time_s.size, dtype=bool)
         object.__setattr__(self, "stale", read_only(stale, np.bool_))
-        shape = (self.time_s.size, len(self.wheels))
-        if self.slip_ratio.shape != shape or self.slip_std.shape != shape:
-            raise ValueError(f"slip_ratio and slip_std must both have shape {shape}")
+        shape = (self.time_s.size, len(self.channels))
+        if self.mean.shape != shape or self.std.shape != shape:
+            raise ValueError(f"mean and std must both have shape {shape}")
         if self.stale.shape != shape[:1]:
             raise ValueError(f"stale must have shape {shape[:1]}")
 
+    @property
+    def wheels(self) -> tuple[str, ...]:
+        """Name of each wheel, track or axle."""
+        return tuple(channel.removeprefix("slip_").rpartition("_")[0] for channel in self.channels)
+
+    @property
+    def ratios(self) -> SlipTrack:
+        """The slips that are ratios, and no angles."""
+        of = [k for k, channel in enumerate(self.channels) if channel.endswith("_ratio")]
+        if len(of) == len(self.channels):
+            return self
+        channels = tuple(self.channels[k] for k in of)
+        return SlipTrack(self.time_s, self.mean[:, of], self.std[:, of], channels, self.stale)
+
     def as_stream(self) -> Stream:
-        """Return the slip ratios as the run-log stream ``slip`` (``slip_<wheel>_ratio``)."""
-        return Stream(self.time_s, self.slip_ratio, tuple(f"slip_{wheel}_ratio" for wheel in self.wheels))
+        """Return the slips as the stream ``slip`` of a log."""
+        return Stream(self.time_s, self.mean, self.channels)
 
 
 WINDOW_COLUMNS = ("start_s", "run_id", "terrain", "session")  #: Of :class:`Windows`, one entry a window

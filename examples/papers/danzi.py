@@ -110,7 +110,7 @@ def steady_mean(slip: Array, estimate: Estimate) -> float:
 
 def steady_slips(estimates: Sequence[Estimate]) -> list[float]:
     """Return the steady slip that a filter estimates, run by run."""
-    return [steady_mean(one.slip.slip_ratio, one) for one in estimates]
+    return [steady_mean(one.slip.mean, one) for one in estimates]
 
 
 def steady_truths(estimates: Sequence[Estimate]) -> list[float]:
@@ -247,7 +247,7 @@ def blind_filters(trial: Trial) -> Finding:
     observable, total = straight_line_rank("slip14", robot, as_printed=True)
     others = {f"{name}, of {n}": k for name, (k, n) in rank.items() if name != "slip14"}
     numbers = {
-        "twelve_states": Numbers.over([steady_mean(one.blind.slip_ratio, one) for one in encoder], beside),
+        "twelve_states": Numbers.over([steady_mean(one.blind.mean, one) for one in encoder], beside),
         "fourteen_states": Numbers.over(
             [steady_mean(_slip_states(one), one) for one in slip],
             beside,
@@ -266,7 +266,7 @@ def blind_filters(trial: Trial) -> Finding:
         Line(label, time_s[moving], values.mean(axis=1)[moving])
         for label, values in (
             ("true", true_slip(encoder[0])),
-            ("12 states, without a camera", encoder[0].blind.slip_ratio),
+            ("12 states, without a camera", encoder[0].blind.mean),
             ("14 states", _slip_states(slip[0])),
         )
     )
@@ -432,7 +432,7 @@ def adaptive_tuning(trial: Trial) -> Finding:
 
 
 def _late_error(estimate: Estimate, length_s: float) -> float:
-    last = mean_between(estimate.blind.slip_ratio, estimate, length_s - 10.0, length_s)
+    last = mean_between(estimate.blind.mean, estimate, length_s - 10.0, length_s)
     return abs(last - steady_mean(true_slip(estimate), estimate))
 
 
@@ -616,7 +616,7 @@ def _slip_with(run: RunLog, robot: Robot, ema_alpha: float | None = None) -> Cur
     ungated = FilterSettings(gate_probability=1.0)
     track = run_filter(model, table.time_s, table.columns(model.rows), ungated)
     slip = wheel_slip(track, table.at(track.time_s), robot)
-    return Curve(track.time_s, slip.slip_ratio, track.state("speed_x_mps"))
+    return Curve(track.time_s, slip.mean, track.state("speed_x_mps"))
 
 
 # -- 7.2.3 and 6.1: slip in a start and in steady driving, its bias, and the camera lost ----------------------------
@@ -647,17 +647,17 @@ def slip_on_terrains(trial: Trial) -> Finding:
 
 def _curve_of(estimate: Estimate) -> Curve:
     track = estimate.track
-    return Curve(track.time_s, estimate.slip.slip_ratio, track.state("speed_x_mps"))
+    return Curve(track.time_s, estimate.slip.mean, track.state("speed_x_mps"))
 
 
 def _slip_figure(estimate: Estimate, terrain: str) -> Figure:
     """Draw the two speeds that slip is made of, and the slip of each wheel with its uncertainty."""
     track, table, true = estimate.track, estimate.table, true_slip(estimate)
     speeds, slips = [Line("speed over ground", track.time_s, track.state("speed_x_mps"), 6)], []
-    for i, wheel in enumerate(estimate.slip.wheels):
+    for i, wheel in enumerate(estimate.robot.wheels):
         rate = table.columns([f"wheel_{wheel}_radps"])[:, 0]
         speeds.append(Line(f"wheel {wheel}", table.time_s, rate * estimate.robot.wheel_radius_m, i))
-        mean, std = estimate.slip.slip_ratio[:, i], estimate.slip.slip_std[:, i]
+        mean, std = estimate.slip.mean[:, i], estimate.slip.std[:, i]
         slips += [
             Band(f"± 2 std, {wheel}", track.time_s, mean - 2 * std, mean + 2 * std, i),
             Line(f"wheel {wheel}", track.time_s, mean, i),
@@ -696,12 +696,12 @@ def camera_lost(trial: Trial) -> Finding:
         return [mean_between(slip(one), one, LOST_S[1] - 0.5, LOST_S[1]) for one in estimates]
 
     true = float(np.mean(at_the_end(vio15, true_slip)))
-    std = float(np.mean(at_the_end(vio15, lambda one: one.slip.slip_std)))
-    error = at_the_end(vio15, lambda one: one.slip.slip_ratio - true_slip(one))
+    std = float(np.mean(at_the_end(vio15, lambda one: one.slip.std)))
+    error = at_the_end(vio15, lambda one: one.slip.mean - true_slip(one))
     numbers = {
-        "thesis": Numbers.over(at_the_end(thesis, lambda one: one.blind.slip_ratio), {"true": true}),
+        "thesis": Numbers.over(at_the_end(thesis, lambda one: one.blind.mean), {"true": true}),
         "vio15": Numbers.over(
-            at_the_end(vio15, lambda one: one.slip.slip_ratio),
+            at_the_end(vio15, lambda one: one.slip.mean),
             {"true": true, "standard deviation by the filter": std},
             worst=max(map(abs, error)),
         ),
@@ -709,12 +709,12 @@ def camera_lost(trial: Trial) -> Finding:
     one = vio15[0]
     time_s = one.track.time_s
     shown = (time_s > LOST_S[0] - 3.0) & (time_s < LOST_S[1] + 3.0)
-    estimated, std_15 = one.slip.slip_ratio.mean(axis=1)[shown], one.slip.slip_std.mean(axis=1)[shown]
+    estimated, std_15 = one.slip.mean.mean(axis=1)[shown], one.slip.std.mean(axis=1)[shown]
     at = time_s[shown]
     marks = [
         Band("± 2 std", at, estimated - 2 * std_15, estimated + 2 * std_15, 0),
         Line("vio15", at, estimated, 0),
-        Line("thesis' filter", at, thesis[0].blind.slip_ratio.mean(axis=1)[shown], 5),
+        Line("thesis' filter", at, thesis[0].blind.mean.mean(axis=1)[shown], 5),
         Line("true", at, true_slip(one).mean(axis=1)[shown], 6),
     ]
     return Finding(numbers, {"lost": time_figure("Slip on grass with the camera lost for 3 s", marks)})

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from terrain.robots import Robot
 
 EXAMPLE = "terrain estimate --data raw/ --filter vio15 --out runs/"
-RESULTS = ("pipelines.slip.filtered", "pipelines.slip.observed", "pipelines.slip.measured")
+RESULTS = ("pipelines.slip.filtered", "pipelines.slip.measured")
 """Modules of the modes, with their results."""
 
 ByFilter = Literal["encoder12", "vio12", "vio15"]
@@ -233,5 +233,6 @@ def _estimated(
         options = options.model_copy(update={"filter": names.pop()})
     number = 2 if options.filter == "pose" else int(options.filter in get_args(ByObserver))
     options.refuse_others([*GROUPS][number], GROUPS, f"is for {{of}}, not for --filter {options.filter}")
-    result: TracksResult = import_module(RESULTS[number]).estimate_all(runs, robot, options, progress, keep)
+    module = import_module(RESULTS[number // 2])
+    result: TracksResult = module.estimate_all(runs, robot, options, progress, keep)
     return result

@@ -1,31 +1,25 @@
-"""``terrain estimate`` by a filter: state and slip of runs, with their errors where a log has a truth."""
+"""``terrain estimate`` by a filter or an observer: state and slip of runs, and errors where a log has a truth."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points, Strip, spans
-from pipelines.report.numbers import format_value, plural
+from pipelines.report.numbers import enumerated, format_value, plural
 from pipelines.report.results import Progress, described
-from pipelines.report.tree import Column, Part, Report, Text
-from pipelines.slip.tracks import (
-    SLIP,
-    TRUTH_COLOUR,
-    Keep,
-    Pictures,
-    TracksResult,
-    estimate_each,
-    estimated,
-    tracks_report,
-)
+from pipelines.report.tree import Column, Part, Report, Text, sections
+from pipelines.slip.shown import first_rows, known_columns
+from pipelines.slip.tracks import Keep, TracksResult
 from terrain.errors import ConfigError
-from terrain.estimation.consistency import lagged_slip_at
 from terrain.estimation.estimate import (
+    FILTERS,
+    SETTLED,
     Estimate,
     EstimateSummary,
     enriched,
@@ -33,7 +27,9 @@ from terrain.estimation.estimate import (
     summarize,
     tuning_of,
 )
+from terrain.estimation.models.observer import ObserverStatus
 from terrain.kinematics.wheels import no_slip_twist
+from terrain.logs.clock import offsets_apart_s
 from terrain.records import GATED, Array, RunLog
 from terrain.robots import Robot, robot_named
 
@@ -41,14 +37,24 @@ if TYPE_CHECKING:
     from pipelines.slip.estimate import EstimateOptions
     from terrain.estimation.tuning import TunedNoise
 
+MAX_PICTURED = 3  #: Runs whose pictures a page has; ``--figures`` writes those of all
+TRUTH_COLOUR = 6  #: Grey, for what was true
+SLIP = "+.4f"
+#: Time from the start that does not set the limits of an axis: estimates begin where nothing is known.
+LATE_S = 2.0
 
-class FilterResult(TracksResult, kw_only=True):
-    """Estimates of runs by a filter."""
 
-    filter: str = described("which filter")
-    tuning: str = described("source of its noise: physical, thesis or likelihood")
+class EstimateResult(TracksResult, kw_only=True):
+    """Estimates of runs by a filter or an observer."""
+
+    filter: str = described("which filter or observer")
+    tuning: str | None = described(
+        "source of a filter's noise: physical, thesis or likelihood; none of an observer"
+    )
     tuned: TunedNoise | None = described("what the tuning 'likelihood' did; none with another")
+    slip_model: Path | None = described("file of the slip model that an observer has")
     runs: tuple[EstimateSummary, ...] = described("figures of each run; slip positive in traction")
+    clocks: tuple[str, ...] = described("a sentence where wheels and IMU of runs do not share a clock")
 
 
 def estimate_all(
@@ -57,26 +63,59 @@ def estimate_all(
     options: EstimateOptions,
     progress: Progress,
     keep: Keep | None,
-) -> FilterResult:
-    """Filter runs, as :func:`pipelines.slip.estimate.estimate_runs`."""
+) -> EstimateResult:
+    """Run a filter or an observer over runs, as :func:`pipelines.slip.estimate.estimate_runs`."""
     assert options.filter is not None  # chosen before
-    name, tuning = options.filter, tuning_of(options.filter, options.tuning)
-    if options.tune_on is not None and tuning != "likelihood":
-        raise ConfigError(f"runs to tune on go with the tuning 'likelihood', not {tuning!r}")
-    variance, tuned = None, None
+    name, file = options.filter, options.slip_model
+    tuning, variance, tuned = None, None, None
+    if name in FILTERS:
+        tuning = tuning_of(name, options.tuning)
+        if options.tune_on is not None and tuning != "likelihood":
+            raise ConfigError(f"runs to tune on go with the tuning 'likelihood', not {tuning!r}")
     if tuning == "likelihood":
         from terrain.estimation.tuning import tuned_noise
 
         variance, tuned = tuned_noise(runs, robot, name, options.tune_on)
+    if file is not None:
+        from terrain.estimation.models.choice import BY_MODEL
+        from terrain.estimation.models.slip_model import read_slip_model
 
-    def robot_of(run: RunLog) -> Robot:
-        return robot or robot_named(run.robot)
+        if name not in (*BY_MODEL, "encoder-odometry"):
+            raise ConfigError(f"filter {name!r} takes no slip model: leave --slip-model out")
+    rows, pictures = [], dict[str, Figure]()
+    for done, run in enumerate(runs, start=1):
+        own = robot or robot_named(run.robot)
+        slip_model = None if file is None else read_slip_model(file, own.name)
+        found = estimate_run(run, own, name, tuning=tuning, process_variance=variance, slip_model=slip_model)
+        rows.append(summarize(found))
+        if keep is not None:
+            keep(enriched(found), partial(figures_of, found))
+        pictures |= figures_of(found) if done <= MAX_PICTURED else {}
+        progress(f"estimate {name}", done, len(runs))
+    return EstimateResult(
+        filter=name,
+        tuning=tuning,
+        tuned=tuned,
+        slip_model=file,
+        runs=tuple(rows),
+        clocks=_clocks_apart(runs, robot) if name == "slip" else (),
+        pictures=pictures,
+    )
 
-    def estimate(run: RunLog) -> tuple[Any, RunLog, Pictures]:
-        found = estimate_run(run, robot_of(run), name, tuning=tuning, process_variance=variance)
-        return summarize(found), enriched(found), partial(figures_of, found)
 
-    return FilterResult(**estimate_each(runs, name, estimate, progress, keep), tuning=tuning, tuned=tuned)
+def _clocks_apart(runs: Sequence[RunLog], robot: Robot | None) -> tuple[str, ...]:
+    """Return a sentence where the turns of robots that skid show that the clocks of wheels and IMU are apart."""
+    robots = {run.run_id: robot or robot_named(run.robot) for run in runs}
+    skidding = [run for run in runs if robots[run.run_id].skids]
+    apart = offsets_apart_s(skidding, lambda run: robots[run.run_id].track_m)
+    if not apart:
+        return ()
+    worst = max(apart, key=lambda run_id: abs(apart[run_id]))
+    return (
+        f"the clocks of wheels and IMU are apart in {len(apart)} of {len(runs)} runs, by "
+        f"{apart[worst]:+.2f} s in {worst}: yaw rates and slip in turns of these are wrong; --align brings the "
+        "wheels onto the IMU's clock",
+    )
 
 
 RUNS = (
@@ -89,49 +128,113 @@ RUNS = (
     Column("NEES", ".2f", of="nees"),
     Column("NIS camera", ".2f", of="nis.camera_speed"),
     Column("speed RMSE", ".4f", "m/s", of="speed_rmse_mps"),
+    Column("position RMSE", ".3f", "m", of="position_rmse_m"),
     Column("dropped", of="n_dropped"),
     Column("gated", of="n_gated"),
 )
 
-SEEING = ("vio12", "vio15")  #: Filters that have a camera
+SLIPS = (
+    Column("run", of="run_id", long=True),
+    Column("slip", of=lambda row: _words(row["name"])),
+    Column("mean", SLIP, of="slip.mean"),
+    Column("std", ".4f", of="slip.std"),
+    Column("true", SLIP, of="slip.true_mean"),
+    Column("RMSE", ".4f", of="slip.rmse"),
+    Column("NEES", ".2f", of="slip.nees"),
+)
 
 BLIND = (
-    "Blind: this filter takes no measurement of the speed over ground, so the figure is the wheels against "
+    "Blind: no measurement of the speed over ground was taken, so the figure is the wheels against "
     "themselves, and the slip in the tracks is NaN; where logs have poses or a lidar twist, --filter pose "
     "measures it."
 )
 
 
-def report(result: FilterResult) -> Report:
-    """Return slip, its truth where it is known, and how consistent the filter was."""
-    blind = not all(row.slip_observable for row in result.runs)
-    columns = [each for each in RUNS if blind or each.title != "observed"]
-    parts: list[Part] = []
+def report(result: EstimateResult) -> Report:
+    """Return slip, its truth where it is known, how consistent the filter was, and what was not measured.
+
+    It leads with the slip of the first run that has one.
+    """
+    blind = any(not row.slip_observable and math.isfinite(row.slip_mean) for row in result.runs)
+    columns = known_columns([each for each in RUNS if blind or each.title != "observed"], result.runs)
+    of_noise = f", {result.tuning} noise" if result.tuning else ""
+    first, all_rows = first_rows(result.runs, columns, f"slip in steady motion, {result.filter}{of_noise}")
+    slips = [
+        {"run_id": row.run_id, "name": name, "slip": slip}
+        for row in result.runs
+        for name, slip in row.slip.items()
+    ]
+    parts: list[Part] = [first]
+    of_slips: tuple[str, list[Part]] = ("", [])
+    if slips:
+        table, of_slips = first_rows(slips, known_columns(SLIPS, slips), "each slip, while the robot moves")
+        parts.append(table)
     if blind:
         parts.append(Text(BLIND, "note"))
     if (tuned := result.tuned) is not None:
         scales = [f"{name} {scale:.3g} ({tuned.status[name]})" for name, scale in tuned.scales.items()]
         parts.append(Text(f"Process variances scaled on {', '.join(tuned.runs)}: {', '.join(scales)}."))
-    return tracks_report(
-        result,
+    parts += [Text(sentence, "warning") for sentence in result.clocks]
+    pictures = dict(result.pictures)
+    lead = next((name for name in pictures if name.endswith("_slip")), next(iter(pictures), ""))
+    writing = f"terrain estimate --data DIR --filter {result.filter} --out runs/"
+    return Report(
         f"Motion and slip by {result.filter}",
         _answer(result),
-        (result.runs, columns, f"filter {result.filter}, {result.tuning} noise"),
-        parts=parts,
+        pictures.pop(lead, None),
+        parts,
+        sections(
+            all_rows,
+            ("All slips", of_slips[1]),
+            ("Statuses", _statuses(result)),
+            ("Pictures", list(pictures.values())),
+            ("Not read", result.skipped),
+        ),
+        writing if result.out is None else f"terrain crossval --data {result.out}",
     )
 
 
-def _answer(result: FilterResult) -> str:
+def _statuses(result: EstimateResult) -> list[str]:
+    lacking = set.intersection(*(set(run.missing) for run in result.runs)) if result.runs else set()
+    sentences = [f"not measured in any run: {', '.join(sorted(lacking))}"] if lacking else []
+    for run in result.runs:
+        times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in run.status_s.items())
+        dropped = f"; left out: {sum(run.dropped.values())} samples" if run.dropped else ""
+        own = [name for name in run.missing if name not in lacking]
+        missing = f"; not measured: {', '.join(own)}" if own else ""
+        why = f"; slip is not known: {run.reason}" if run.reason else ""
+        sentences.append(f"{run.run_id}: {times}{dropped}{missing}{why}")
+    return sentences
+
+
+def _answer(result: EstimateResult) -> str:
     n = plural(len(result.runs), "run")
     known = [row for row in result.runs if row.slip_observable and math.isfinite(row.slip_mean)]
     if known:
-        means, std = [row.slip_mean for row in known], max(row.slip_std for row in known)
-        slip = (
-            format_value(means[0], SLIP) if len(means) == 1 else format_value((min(means), max(means)), SLIP)
-        )
+        slip, std = _range([row.slip_mean for row in known]), max(row.slip_std for row in known)
         deviation = format_value(std, ".4f")
         return f"Slip in steady motion is {slip} in {n}, with a standard deviation of at most {deviation}."
-    return f"Motion of {n} is estimated; slip is not known in steady motion."
+    means: dict[str, list[float]] = {}
+    for row in result.runs:
+        for name, of_wheel in row.slip.items():
+            means.setdefault(name, []).extend([of_wheel.mean] if math.isfinite(of_wheel.mean) else [])
+    if any(means.values()):
+        each = [f"{_words(name)} is {_range(values)}" for name, values in means.items() if values]
+        return f"In the means of {n}, {enumerated(each)}."
+    reasons = sorted({row.reason for row in result.runs if row.reason})
+    why = f": {'; '.join(reasons)}" if reasons else ""
+    errors = [row.position_rmse_m for row in result.runs if math.isfinite(row.position_rmse_m)]
+    off = f"; its position is off by at most {format_value(max(errors), '.3f', 'm')} RMS" if errors else ""
+    return f"Motion of {n} is estimated{off}; slip is not known{why}."
+
+
+def _range(values: Sequence[float]) -> str:
+    return format_value((min(values), max(values)) if len(values) > 1 else values[0], SLIP)
+
+
+def _words(channel: str) -> str:
+    """Return a channel as a reader writes it: ``slip left`` of ``slip_left_ratio``."""
+    return channel.rpartition("_")[0].replace("_", " ")
 
 
 LABELS = {
@@ -143,93 +246,135 @@ LABELS = {
 
 
 def figures_of(estimate: Estimate) -> dict[str, Figure]:
-    """Return ``<run>_motion`` and ``<run>_slip``."""
-    run_id = estimate.run.run_id
-    return {f"{run_id}_motion": motion_figure(estimate), f"{run_id}_slip": slip_figure(estimate)}
+    """Return ``<run>_motion``, ``<run>_slip`` and ``<run>_path``, those that there is something to show in."""
+    run_id, states, figures = estimate.run.run_id, estimate.track.states, dict[str, Figure]()
+    if any(state in states for state in LABELS):
+        figures[f"{run_id}_motion"] = motion_figure(estimate)
+    if estimate.slip.channels:
+        figures[f"{run_id}_slip"] = slip_figure(estimate)
+    if "position_x_m" in states:
+        figures[f"{run_id}_path"] = path_figure(estimate)
+    return figures
+
+
+def estimated(label: str, time_s: Array, mean: Array, std: Array, true: Array | None = None) -> list[Mark]:
+    """Return an estimate (n,) over time, the band of two standard deviations, and what was true where it is known."""
+    marks: list[Mark] = [
+        Band("± 2 std", time_s, mean - 2 * std, mean + 2 * std, 0),
+        Line(label, time_s, mean, 0),
+    ]
+    if true is not None and np.isfinite(true).any():
+        marks.append(Line("truth", time_s, true, TRUTH_COLOUR, dashed=True))
+    return marks
 
 
 def motion_figure(estimate: Estimate) -> Figure:
     """Show motion as estimated, as sensors measured it and as it was, and innovations."""
-    track, table, name = estimate.track, estimate.table, estimate.name
-    panels = []
-    for state, sensors in _measured(estimate).items():
+    track, name, panels = estimate.track, estimate.name, []
+    measured = _measured(estimate)
+    for state, label in LABELS.items():
+        if state not in track.states:
+            continue
         marks: list[Mark] = [
-            Line(each, table.time_s, sensors[each], i) for i, each in enumerate(sensors, start=1)
+            Line(sensor, track.time_s, values, i)
+            for i, (sensor, values) in enumerate(measured.get(state, {}).items(), start=1)
         ]
-        true = None if estimate.truth is None else estimate.truth[:, track.states.index(state)]
-        known = true if true is not None and np.isfinite(true).any() else None
-        marks += estimated(name, track.time_s, track.state(state), track.std(state), 2, known)
-        panels.append(Panel(marks, LABELS[state]))
+        true = estimate.true(state)
+        if estimate.truth is not None:
+            true = estimate.truth[:, track.states.index(state)]
+        marks += estimated(name, track.time_s, track.state(state), track.std(state), true)
+        panels.append(Panel(marks, label))
     innovations = estimate.innovations
-    for row in [f"camera_{state}" for state in LABELS] if name in SEEING else ["gyro_z_radps"]:
-        value, std = innovations[row]
-        sensor = next(k for k, (_, names) in enumerate(estimate.model.sensors) if row in names)
-        gated = track.use[:, sensor] == GATED
-        used = value[~gated & np.isfinite(value)]
-        marks = [
-            Band("± 2 std expected", track.time_s, -2 * std, 2 * std, 6),
-            Line("innovation", track.time_s, np.where(gated, np.nan, value), 0),
-        ]
-        if gated.any():
-            marks.append(Points("gated", track.time_s[gated], np.zeros(gated.sum()), colour=5))
-        title, reach = f"innovation of {row}, variance none", None
-        if used.size:
-            title = f"innovation of {row}, variance {used.var():.1e}"
-            most = 1.2 * max(float(np.nanmax(2 * std)), float(np.percentile(np.abs(used), 99.5)))
-            reach = -most, most
-        panels.append(Panel(marks, "innovation", title, y_range=reach))
+    seen = [f"camera_{state}" for state in LABELS if f"camera_{state}" in innovations]
+    for row in seen or ["gyro_z_radps"] * bool(innovations):
+        panels.append(_innovation_panel(estimate, row, *innovations[row]))
     return Figure(
         f"{estimate.run.run_id}: motion by {name}",
         panels,
-        "Estimates with two standard deviations beside the sensors; the truth behind the same low-pass. "
+        "Estimates with two standard deviations beside the sensors, and the truth. "
         "Innovations beside the two standard deviations that the filter expected of them.",
         x_label="time [s]",
     )
 
 
+def _innovation_panel(estimate: Estimate, row: str, value: Array, std: Array) -> Panel:
+    track, model = estimate.track, estimate.model
+    assert model is not None  # whose innovations these are
+    sensor = next(k for k, (_, names) in enumerate(model.sensors) if row in names)
+    gated = track.use[:, sensor] == GATED
+    used = value[~gated & np.isfinite(value)]
+    marks: list[Mark] = [
+        Band("± 2 std expected", track.time_s, -2 * std, 2 * std, 6),
+        Line("innovation", track.time_s, np.where(gated, np.nan, value), 0),
+    ]
+    if gated.any():
+        marks.append(Points("gated", track.time_s[gated], np.zeros(gated.sum()), colour=5))
+    title, reach = f"innovation of {row}, variance none", None
+    if used.size:
+        title = f"innovation of {row}, variance {used.var():.1e}"
+        most = 1.2 * max(float(np.nanmax(2 * std)), float(np.percentile(np.abs(used), 99.5)))
+        reach = -most, most
+    return Panel(marks, "innovation", title, y_range=reach)
+
+
 def _measured(estimate: Estimate) -> dict[str, dict[str, Array]]:
     """Return by state what the sensors say of it (n,)."""
     table, robot = estimate.table, estimate.robot
-    gyro = {"gyro": table.columns(["gyro_z_radps"])[:, 0]}
-    rates = table.columns([f"wheel_{wheel}_radps" for wheel in robot.wheels])
-    steer = table.columns([f"steer_{wheel}_rad" for wheel in robot.wheels])
+    if table is None:
+        return {}
+    rates, steer = table.columns(robot.wheel_rows), table.columns(robot.steer_rows)
     twist = no_slip_twist(robot.wheel_positions_m, steer, robot.wheel_radius_m * rates)[0]
     found = {}
-    for state, wheels in zip(("speed_x_mps", "speed_y_mps", "yaw_rate_radps"), twist.T, strict=True):
+    for state, wheels in zip(LABELS, twist.T, strict=True):
         found[state] = {"encoders, forward kinematics": wheels}
-        if estimate.name in SEEING:
+        if estimate.model is not None and f"camera_{state}" in estimate.model.rows:
             found[state]["camera, at its place"] = table.columns([f"camera_{state}"])[:, 0]
-    found["yaw_rate_radps"] |= gyro
+    found["yaw_rate_radps"]["gyro"] = table.columns(["gyro_z_radps"])[:, 0]
     return found
 
 
 def slip_figure(estimate: Estimate) -> Figure:
-    """Show the slip of each wheel with its uncertainty, and the two speeds that it is made of."""
-    track, slip, table, robot = estimate.track, estimate.slip, estimate.table, estimate.robot
-    time_s, observed, ahead_mps = track.time_s, estimate.observable, track.state("speed_x_mps")
-    shown = slip if observed else estimate.blind
-    true = lagged_slip_at(estimate.run, robot, time_s) if "truth" in estimate.run.streams else None
-    speeds = robot.wheel_radius_m * table.columns([f"wheel_{wheel}_radps" for wheel in slip.wheels])
-    above: list[Mark] = [Line("speed over ground, estimated", time_s, ahead_mps, 6)]
-    below: list[Mark] = []
-    for i, wheel in enumerate(slip.wheels):
-        above.append(Line(f"circumference, wheel {wheel}", table.time_s, speeds[:, i], i))
-        ratio, half = shown.slip_ratio[:, i], 2 * slip.slip_std[:, i]
-        if observed:
-            below.append(Band(f"± 2 std, wheel {wheel}", time_s, ratio - half, ratio + half, i))
-        below.append(Line(f"wheel {wheel}", time_s, ratio, i))
-        if true is not None:
-            below.append(Line(f"truth, wheel {wheel}", time_s, true[:, i], TRUTH_COLOUR, dashed=True))
-    below.append(Strip(spans(time_s, slip.stale, {1: "stale: no speed reference"})))
-    if np.isfinite(mean := estimate.figures.steady_mean):
-        below.append(Line(f"steady mean {mean:.3f}", time_s[[0, -1]], [mean, mean], 5, dashed=True))
-    y_range = (-0.6 if np.nanmin(np.append(ahead_mps, 0.0)) < -0.1 else -0.05, 0.6)
-    return Figure(
-        f"{estimate.run.run_id}: {'slip' if observed else 'slip is not observed'}, {estimate.name}",
-        (
-            Panel(above, "speed [m/s]"),
-            Panel(below, "slip ratio" if observed else "blind figure, no slip", y_range=y_range),
-        ),
-        "Slip of each wheel with two standard deviations; the truth is behind the same low-pass.",
-        x_label="time [s]",
-    )
+    """Show each slip over time with two standard deviations, and its truth where there is one."""
+    time_s, observed = estimate.track.time_s, estimate.observable
+    shown = estimate.slip if observed or estimate.blind is None else estimate.blind
+    away = ~np.isin(estimate.status, (*SETTLED, ObserverStatus.STANDING))
+    strip = Strip(spans(time_s, away, {1: "does not follow measurements"}))
+    panels, mean = [], estimate.figures.steady_mean
+    for name, slip, std in zip(shown.channels, shown.mean.T, estimate.slip.std.T, strict=True):
+        scale, unit = (np.degrees(1.0), "degrees") if name.endswith("_rad") else (1.0, "ratio")
+        true = estimate.true(name)
+        marks = estimated(
+            "estimate", time_s, scale * slip, scale * std, None if true is None else scale * true
+        )
+        if np.isfinite(mean) and name in shown.ratios.channels:
+            marks.append(Line(f"steady mean {mean:.3f}", time_s[[0, -1]], [mean, mean], 5, dashed=True))
+        label = f"{_words(name)} [{unit}]" if observed else f"{_words(name)}: blind, no slip"
+        panels.append(Panel([*marks, strip], label, y_range=_y_range(time_s, scale * slip)))
+    title = f"{estimate.run.run_id}: {'slip' if observed else 'slip is not observed'}, {estimate.name}"
+    return Figure(title, panels, "Each slip with two standard deviations.", x_label="time [s]")
+
+
+def path_figure(estimate: Estimate) -> Figure:
+    """Show the estimated path, the fixes, and the true one where it is known."""
+    own, true = estimate.path()
+    marks: list[Mark] = []
+    for name in ("pose", "gnss") if estimate.in_world else ():
+        stream = estimate.run.streams.get(name)
+        if stream is not None and "position_x_m" in stream.channels:
+            x, y = stream.columns(["position_x_m", "position_y_m"]).T
+            marks.append(Points(f"measured ({name})", x, y, colour=4))
+            break
+    marks.append(Line("estimate", own.real, own.imag, 0))
+    if true is not None:
+        marks.append(Line("truth", true.real, true.imag, TRUTH_COLOUR, dashed=True))
+    title, panel = f"{estimate.run.run_id}: path, {estimate.name}", Panel(marks, "y [m]", equal=True)
+    return Figure(title, (panel,), f"Estimated by '{estimate.name}'.", x_label="x [m]")
+
+
+def _y_range(time_s: Array, slip: Array) -> tuple[float, float] | None:
+    """Return the range of the values after the start, and a tenth of it around them."""
+    known = slip[np.isfinite(slip) & (time_s > time_s[0] + min(LATE_S, 0.1 * np.ptp(time_s)))]
+    if not known.size or np.ptp(known) == 0.0:
+        return None
+    margin = 0.1 * np.ptp(known)
+    return float(known.min() - margin), float(known.max() + margin)

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,11 +17,8 @@ from terrain.discrepancy.runs import LowPass, Signals, Simulation, rows_of
 from terrain.effects import CHANNELS
 from terrain.errors import DataError, NotTakenWarning, TerrainError
 from terrain.estimation.estimate import estimate_run, summarize
-from terrain.records import Array, RunLog, StateTrack
+from terrain.records import Array, RunLog
 from terrain.robots import Robot
-
-if TYPE_CHECKING:
-    from terrain.estimation.models.observer import ObserverTrack
 
 HOLD_OUT_FROM, HOLD_OUT_EVERY = 24, 4
 """With so many runs or more, one in every so many is held out; of fewer a quarter is too few to judge on."""
@@ -163,24 +160,9 @@ def filter_gain(runs: Sequence[RunLog], robot: Robot, extended: Simulation, seed
 
 def _errors(run: RunLog, robot: Robot, name: str) -> tuple[float, ...]:
     """Return the errors of a run, in the order of :data:`ERRORS`."""
-    track: StateTrack | ObserverTrack
-    if name == "slip":
-        from terrain.estimation.observe import (
-            observe_run,
-            summarize_observer,
-        )  # with kernels others do not need
-
-        observed = observe_run(run, robot, name)
-        slips = summarize_observer(observed).slip.values()
-        track, slip_error = (
-            observed.track,
-            float(np.mean([abs(each.mean - each.true_mean) for each in slips])),
-        )
-    else:
-        found = estimate_run(run, robot, name)
-        summary, track = summarize(found), found.track
-        error = abs(summary.slip_mean - summary.slip_true_mean)
-        slip_error = error if summary.slip_observable else math.nan
+    found = estimate_run(run, robot, name)
+    slips, track = summarize(found).slip.values(), found.track
+    slip_error = float(np.mean([abs(each.mean - each.true_mean) for each in slips]))
     truth, squares = run.streams["truth"], []
     for state in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"):
         true = np.interp(track.time_s, truth.time_s, truth.channel(state))

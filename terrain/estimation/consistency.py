@@ -230,10 +230,11 @@ def lagged_slip_at(run: RunLog, robot: Robot, time_s: Array) -> Array:
     return np.column_stack([np.interp(time_s, run.streams["truth"].time_s, wheel) for wheel in slip.T])
 
 
-def true_slip_at(run: RunLog, robot: Robot, time_s: Array) -> Array:
+def true_slip_at(run: RunLog, wheels: Sequence[str], time_s: Array) -> Array:
     """Return the true slip (n, wheels), positive in traction, from some instants on; NaN without a truth."""
     truth = run.streams.get("truth")
-    if truth is None:
-        return np.full((len(time_s), len(robot.wheels)), np.nan)
+    names = {f"wheel_{wheel}_radps" for wheel in wheels}
+    if truth is None or not names or not names <= set(truth.channels):
+        return np.full((len(time_s), len(wheels)), np.nan)
     at = np.clip(np.searchsorted(truth.time_s, time_s), 0, len(truth) - 1)
-    return true_slip(truth, robot.wheels)[at]
+    return true_slip(truth, wheels)[at]

@@ -104,7 +104,8 @@ def wheel_slip(track: StateTrack, table: MeasurementTable, robot: Robot, blind: 
         unmeasured_s = np.maximum(unmeasured_s, time_s - np.maximum.accumulate(measured_s, axis=0))
     speeds, age_s = robot.wheel_speeds_mps(table.columns(robot.wheel_rows)), track.reference_age_s
     slip = WheelSlip(robot, track.states, blind)(track.mean, track.cov, speeds, age_s, unmeasured_s)
-    return SlipTrack(track.time_s, *slip, robot.wheels, age_s > STALE_AFTER_S)
+    channels = tuple(map("slip_{}_ratio".format, robot.wheels))
+    return SlipTrack(track.time_s, *slip, channels, age_s > STALE_AFTER_S)
 
 
 @njit(error_model="numpy")
@@ -208,7 +209,7 @@ def slip_figures(
     started = slip.time_s - slip.time_s[:1] >= STEADY_BEFORE_S - 1e-9
     moving = speed > STEADY_SPEED_MPS
     steady = moving & started & (change < STEADY_CHANGE_MPS)
-    ratio = slip.slip_ratio if rolling is None else slip.slip_ratio * rolling
+    ratio = slip.mean if rolling is None else slip.mean * rolling
     known = np.isfinite(ratio)
     in_steady, transient = ratio[known & steady[:, None]], ratio[known & (moving & ~steady)[:, None]]
     mean = float(in_steady.mean()) if in_steady.size else math.nan

@@ -210,7 +210,7 @@ def wheel_forces(
         thrust_change = np.abs(_smooth(np.gradient(thrust, clock, axis=0), clock))
         thrust_rate = thrust_change / np.maximum(robot.mass_kg * load, 1.0)
     conditions = {
-        "slip known": np.isfinite(slip.slip_ratio) & (slip.slip_std < MAX_SLIP_STD),
+        "slip known": np.isfinite(slip.mean) & (slip.std < MAX_SLIP_STD),
         "speed fresh": np.repeat(fresh[:, None], 3, axis=1),
         "moving": np.abs(forward) > MIN_SPEED_MPS,
         "rolling straight": oblique | (side_slip < SMALL_SLIP),
@@ -232,7 +232,7 @@ def wheel_forces(
     return WheelForces(
         time_s=clock,
         slip_ratio=np.where(conditions["slip known"], along_slip * factor, np.nan),
-        slip_std=slip.slip_std,
+        slip_std=slip.std,
         thrust_n=thrust * factor,
         load_npkg=load,
         reference_speed_mps=reference,

@@ -349,7 +349,8 @@ class MeasuredSlip(NamedTuple):
     @property
     def track(self) -> SlipTrack:
         """The slips of the wheels, at the middle of each window."""
-        return SlipTrack(self.time_s, self.slip_ratio, self.slip_std, self.wheels)
+        channels = tuple(map("slip_{}_ratio".format, self.wheels))
+        return SlipTrack(self.time_s, self.slip_ratio, self.slip_std, channels)
 
     @property
     def stream(self) -> Stream:

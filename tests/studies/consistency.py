@@ -62,10 +62,10 @@ def slip_coverage(estimate: Estimate, between_s: tuple[float, float] = (-math.in
     if "truth" not in estimate.run.streams:
         return math.nan
     slip = estimate.slip
-    error = np.abs(slip.slip_ratio - lagged_slip_at(estimate.run, estimate.robot, slip.time_s))
-    known = np.isfinite(error) & np.isfinite(slip.slip_std)
+    error = np.abs(slip.mean - lagged_slip_at(estimate.run, estimate.robot, slip.time_s))
+    known = np.isfinite(error) & np.isfinite(slip.std)
     known &= ((slip.time_s >= between_s[0]) & (slip.time_s <= between_s[1]))[:, None]
-    inside = error[known] <= ndtri(0.975) * slip.slip_std[known]
+    inside = error[known] <= ndtri(0.975) * slip.std[known]
     return float(inside.mean()) if inside.size else math.nan
 
 

@@ -15,7 +15,7 @@ from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import JobsSettings, Names, setting
 from pipelines.report.tree import Report, Table
 from terrain.errors import ConfigError
-from terrain.estimation.observe import observe_run
+from terrain.estimation.estimate import estimate_run
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot, SkidSteerRobot, load_robot
 from terrain.simulation.run import simulate_run
@@ -102,18 +102,17 @@ def errors_of(run: RunLog, robot: Robot, between_s: tuple[float, float]) -> tupl
 
     The truth comes behind the low-pass of the encoders, as the wheels' speeds do.
     """
-    found, truth = observe_run(run, robot, "slip"), run.streams["truth"]
-    track, errors, relative = found.track, [], []
-    at_s = track.time_s - robot.encoder_lag_s
-    for k, name in enumerate(track.slips):
+    found, truth = estimate_run(run, robot, "slip"), run.streams["truth"]
+    slip, errors, relative = found.slip, [], []
+    at_s = slip.time_s - robot.encoder_lag_s
+    for k, (name, wheel) in enumerate(zip(slip.channels, slip.wheels, strict=True)):
         if name not in truth.channels:  # a wheel that never turned
             continue
-        wheel = name.removeprefix("slip_").removesuffix("_ratio")
         true = np.clip(np.interp(at_s, truth.time_s, truth.channel(name)), -1.0, 1.0)  # as slip_ratio is
         turns = np.interp(at_s, truth.time_s, truth.channel(f"wheel_{wheel}_radps")) * robot.wheel_radius_m
-        chosen = (np.abs(turns) > LEAST_MPS) & (track.time_s > between_s[0]) & (track.time_s < between_s[1])
-        errors.append((track.slip[:, k] - true)[chosen])
-        relative.append(errors[-1] / track.slip_std[chosen, k])
+        chosen = (np.abs(turns) > LEAST_MPS) & (slip.time_s > between_s[0]) & (slip.time_s < between_s[1])
+        errors.append((slip.mean[:, k] - true)[chosen])
+        relative.append(errors[-1] / slip.std[chosen, k])
     return np.concatenate(errors), np.concatenate(relative)
 
 

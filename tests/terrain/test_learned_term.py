@@ -12,7 +12,6 @@ from terrain.effects import HEADING, SPEED_X, SPEED_Y
 from terrain.errors import ConfigError, NotTakenWarning
 from terrain.estimation.estimate import estimate_run
 from terrain.estimation.live import make_live_filter
-from terrain.estimation.observe import observe_run
 from terrain.extension import correct, correct_live, extended_yaml, rolling_axle
 from terrain.learned_term import INPUTS, LearnedTerm, factors_of, learned_lines, read_learned
 from terrain.logs.replay import replay
@@ -79,10 +78,10 @@ def test_it_is_off_outside_its_region_and_smooth_at_its_edge():
 
 
 def test_the_filter_of_a_robot_that_has_it_finds_no_slip_where_it_takes_it_off():
-    tracks = [observe_run(driven(LEARNED), robot, "slip").track for robot in (LEARNED, HUSKY)]
-    found, plain = (np.sqrt(np.nanmean(track.slip[100:] ** 2)) for track in tracks)
+    estimates = [estimate_run(driven(LEARNED), robot, "slip") for robot in (LEARNED, HUSKY)]
+    found, plain = (np.sqrt(np.nanmean(each.slip.mean[100:] ** 2)) for each in estimates)
     assert 2.0 * found < plain
-    found, plain = (abs(track.state("turn_loss_ratio")[-1]) for track in tracks)
+    found, plain = (abs(each.track.state("turn_loss_ratio")[-1]) for each in estimates)
     assert 5.0 * found < plain
 
 
@@ -154,14 +153,14 @@ def test_filters_of_a_robot_that_steers_are_nearer_to_how_it_moves(name, factor)
     found, plain = (estimate_run(steered(), robot, name) for robot in (SLIDES, STEERS))
     speeds = "speed_x_mps", "speed_y_mps"
     assert factor * error_of(found.track, steered(), speeds) < error_of(plain.track, steered(), speeds)
-    slips = [np.sqrt(np.nanmean(each.blind.slip_ratio[100:] ** 2)) for each in (found, plain)]
+    slips = [np.sqrt(np.nanmean(each.blind.mean[100:] ** 2)) for each in (found, plain)]
     assert 2.0 * slips[0] < slips[1]
 
 
 @pytest.mark.parametrize("name", ["sideslip-kinematic", "sideslip-dynamic", "sideslip-multi"])
 def test_observers_of_a_car_take_its_axle_and_steering_to_roll_so(name):
-    found, plain = (observe_run(car_run(), robot, name).track for robot in (DRIFTS, CAR))
-    slips = [np.sqrt(np.nanmean(each.slip[100:] ** 2)) for each in (found, plain)]
+    found, plain = (estimate_run(car_run(), robot, name) for robot in (DRIFTS, CAR))
+    slips = [np.sqrt(np.nanmean(each.slip.mean[100:] ** 2)) for each in (found, plain)]
     assert 1.8 * slips[0] < slips[1]
 
 
@@ -200,7 +199,7 @@ def test_live_is_the_log_of_robots_that_steer():
     live = live_track(steered(), "vio15", *correct_live(SLIDES))
     np.testing.assert_array_equal(live, live_track(log, "vio15", robot, None))
     live = live_track(car_run(), "sideslip-multi", *correct_live(DRIFTS))
-    whole = observe_run(car_run(), DRIFTS, "sideslip-multi").track.mean
+    whole = estimate_run(car_run(), DRIFTS, "sideslip-multi").track.mean
     np.testing.assert_array_equal(live, whole[: len(live)])
     assert len(live) > 200
 

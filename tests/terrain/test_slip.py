@@ -90,25 +90,25 @@ def test_slip_angle_is_positive_to_the_left_for_both_rolling_directions():
 def test_uncertainty_of_wheel_speeds_is_by_default_the_robots_own_and_encoders_alone_have_no_slip():
     track = make_track([0.8, *[0.0] * 5], WITHOUT)
     table = make_table(track, 1.0)
-    wheel_speed_std = wheel_slip(track, table, ROBOT).slip_std[0, 0] / 0.8
+    wheel_speed_std = wheel_slip(track, table, ROBOT).std[0, 0] / 0.8
     # the ripple of Hall steps behind the low-pass, drawn step by step
     dt, step = 1e-4, 2 * np.pi / 900
     count = np.floor(np.arange(0, 4, dt) * 5.0 / step)
     seen = lfilter([1 - np.exp(-dt / 0.05)], [1, -np.exp(-dt / 0.05)], np.diff(count) * step / dt)
     assert wheel_speed_std == pytest.approx(seen[5000:].std() * ROBOT.wheel_radius_m, rel=0.03)
     nameless = wheel_slip(track, table, ROBOT.without("sensors"))
-    assert np.isnan(nameless.slip_std).all()
-    np.testing.assert_allclose(nameless.slip_ratio, 0.2)
+    assert np.isnan(nameless.std).all()
+    np.testing.assert_allclose(nameless.mean, 0.2)
     # a filter of encoders believes the wheels, at whatever speed the robot goes: a figure to show, and no slip
     track = make_track(np.tile([1.0, *[0.0] * 5], (5, 1)), WITHOUT, age_s=np.inf)
     table = make_table(track, 1.001)
     slip = wheel_slip(track, table, ROBOT)
-    assert np.isnan([slip.slip_ratio, slip.slip_std]).all()
-    np.testing.assert_allclose(wheel_slip(track, table, ROBOT, blind=True).slip_ratio, 0.001, atol=1e-6)
+    assert np.isnan([slip.mean, slip.std]).all()
+    np.testing.assert_allclose(wheel_slip(track, table, ROBOT, blind=True).mean, 0.001, atol=1e-6)
     # with a slip ratio for a state too: nothing determines it
     states = np.tile([1.0, *[0.0] * 5, *[0.4] * 3], (5, 1))
     more = make_track(states, (*WITHOUT, "slip_1_ratio", "b", "c"), age_s=np.inf)
-    assert np.isnan(wheel_slip(more, table, ROBOT).slip_ratio).all()
+    assert np.isnan(wheel_slip(more, table, ROBOT).mean).all()
 
 
 def test_slip_is_unknown_where_the_ground_was_never_seen_and_stale_where_not_lately():
@@ -122,11 +122,11 @@ def test_slip_is_unknown_where_the_ground_was_never_seen_and_stale_where_not_lat
     # a filter that leans on the wheels then would say 0
     leaning = wheel_slip(make_track(mean[:, :6], WITHOUT, cov[:, :6, :6], age), table, ROBOT)
     for found, unknown in ((slip, never), (leaning, stale)):
-        np.testing.assert_array_equal(np.isnan(found.slip_ratio).all(axis=1), unknown)
-        np.testing.assert_array_equal(np.isnan(found.slip_std).any(axis=1), unknown)
+        np.testing.assert_array_equal(np.isnan(found.mean).all(axis=1), unknown)
+        np.testing.assert_array_equal(np.isnan(found.std).any(axis=1), unknown)
         np.testing.assert_array_equal(found.stale, stale)
-    np.testing.assert_allclose(slip.slip_ratio[~never], 0.125)
-    assert (np.diff(slip.slip_std[2:, 0]) > 0).all()  # as the state's does
+    np.testing.assert_allclose(slip.mean[~never], 0.125)
+    assert (np.diff(slip.std[2:, 0]) > 0).all()  # as the state's does
 
 
 def test_tracks_and_tables_that_do_not_match_are_refused():
@@ -214,15 +214,15 @@ def test_figures_of_a_run_come_from_its_steady_and_its_transient_parts():
 
 def test_figures_without_steady_or_moving_samples_are_nan():
     slip, speed, time = drive(np.full((600, 3), 0.1))
-    few = SlipTrack(time[:20], slip.slip_ratio[:20], slip.slip_std[:20], slip.wheels)
+    few = SlipTrack(time[:20], slip.mean[:20], slip.std[:20], slip.channels)
     for some, speed_mps in ((slip, np.zeros(600)), (few, speed), (slip, np.full(600, np.nan))):
         figures = slip_figures(some, speed_mps, time)
         assert np.isnan(figures.steady_mean)
         assert not figures.steady.any()
         assert np.isnan(figures.peak) or some is few
-    one_lost = np.array(slip.slip_ratio)
+    one_lost = np.array(slip.mean)
     one_lost[:, 1] = np.nan
-    figures = slip_figures(SlipTrack(time, one_lost, one_lost, slip.wheels), speed, time)
+    figures = slip_figures(SlipTrack(time, one_lost, one_lost, slip.channels), speed, time)
     assert figures.steady_mean == pytest.approx(0.1)
     assert figures.peak == 0.6
 
@@ -247,17 +247,17 @@ def test_slip_and_its_uncertainty_are_those_of_its_plain_form(states, monkeypatc
         return float(slip_ratio(speed, ground)), max(abs(speed), abs(ground)), abs(abs(speed) - abs(ground))
 
     n_compared = 0
-    for k, wheel in np.argwhere(np.isfinite(slip.slip_ratio)):
+    for k, wheel in np.argwhere(np.isfinite(slip.mean)):
         numbers = np.append(mean[k], wheel_speed_mps[k, wheel])
         ratio, fastest, apart = plain(numbers, wheel)
-        assert slip.slip_ratio[k, wheel] == pytest.approx(ratio, abs=1e-12)
+        assert slip.mean[k, wheel] == pytest.approx(ratio, abs=1e-12)
         if abs(ratio) == 1.0 or min(fastest - 0.05, apart) < 1e-3:  # clipped, or beside a kink
             continue
         steps = 1e-6 * np.eye(d + 1)
         slope = [(plain(numbers + e, wheel)[0] - plain(numbers - e, wheel)[0]) / 2e-6 for e in steps]
         slope = np.nan_to_num(slope)
         variance = slope[:d] @ root @ root.T @ slope[:d] + (slope[d] * 0.05) ** 2
-        assert slip.slip_std[k, wheel] == pytest.approx(np.sqrt(variance), rel=1e-5)
+        assert slip.std[k, wheel] == pytest.approx(np.sqrt(variance), rel=1e-5)
         n_compared += 1
     assert n_compared > 100
-    assert np.isnan(slip.slip_ratio).any()
+    assert np.isnan(slip.mean).any()

@@ -16,7 +16,6 @@ from pipelines.live.observer import Observer
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import DataError
 from terrain.estimation.estimate import enriched, estimate_run
-from terrain.estimation.observe import observe_run, with_estimates
 from terrain.logs.replay import replay
 from terrain.records import Reading, RunLog, Stream
 from terrain.robots import load_robot
@@ -71,7 +70,7 @@ def test_a_skid_steer_robot_is_filtered_where_its_model_needs_the_filter(trained
     if not (DATA / "vulpi").is_dir():
         pytest.skip("TERRAIN_DATA has no vulpi")
     runs = load_runs(DATA / "vulpi")
-    model = trained([with_estimates(observe_run(run, HUSKY, "slip")) for run in runs[::2]])
+    model = trained([enriched(estimate_run(run, HUSKY, "slip")) for run in runs[::2]])
     assert (model.info.filter, model.info.robots) == ("slip", ("husky",))
     rows = predict(runs[5:6], model, TABLE).windows
     assert len(rows) > 5
@@ -89,7 +88,7 @@ def test_slip_by_an_observer_of_tracked_robots_is_a_feature_in_the_log_and_live(
         for k in (1, 2, 3)
     ]
     unseen = runs.pop(2)
-    model = trained([with_estimates(observe_run(run, robot, "tracked")) for run in runs[:4]])
+    model = trained([enriched(estimate_run(run, robot, "tracked")) for run in runs[:4]])
     assert model.info.filter == "tracked"
     assert set(model.info.channels["slip"]) == {"slip_left_ratio", "slip_right_ratio"}
     rows = predict([unseen], model, TABLE).windows

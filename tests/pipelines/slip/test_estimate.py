@@ -48,20 +48,20 @@ def test_runs_are_written_with_their_tracks_and_pictures(tmp_path):
     result = run(settings, lambda *step: seen.append(step))
     assert seen == [("estimate vio15", 1, 1)]
     document = result.as_json()
-    assert set(document) == {"filter", "tuning", "tuned", "out", "runs", "skipped"}
+    assert set(document) == {"filter", "tuning", "tuned", "slip_model", "out", "runs", "clocks", "skipped"}
     assert json.loads(json.dumps(document)) == document
     found = read_run(out / straight.run_id)
     assert found.streams["slip"].channels == ("slip_1_ratio", "slip_2_ratio", "slip_3_ratio")
     assert found.streams["estimator"].channels[0] == "speed_x_mps"
     state = found.streams["state"]
-    seen = {"slip_speed_1_mps", "std_slip_1_ratio", "stale_ratio", "nis_camera_speed_ratio"}
+    seen = {"slip_speed_1_mps", "std_slip_1_ratio", "stale_ratio", "observer_code", "nis_camera_speed_ratio"}
     assert seen <= set(state.channels)
     assert (state.channel("std_speed_x_mps") > 0).all()
     assert all(signal_set_of("state", channel) is None for channel in state.channels)
     assert {"speed_1_mps", "current_1_a", "motor_1_radps"} <= set(found.streams["wheels"].channels)
     assert found.labels == straight.labels
     pictures = sorted(file.name for file in (tmp_path / "figures").iterdir())
-    assert pictures == [f"{straight.run_id}_{kind}.png" for kind in ("motion", "slip")]
+    assert pictures == [f"{straight.run_id}_{kind}.png" for kind in ("motion", "path", "slip")]
     with pytest.raises(LogError, match="is there already"):
         run(settings, silent)
     page = result.report.save(tmp_path / "page.html").read_text()
@@ -110,4 +110,4 @@ def test_an_observer_gives_slip_of_tracks_and_a_path():
     (row,) = tracks.result.runs
     assert set(row.slip) == {"slip_left_ratio", "slip_right_ratio"}
     assert {"slip", "estimator", "state"} <= set(tracks.runs[0].streams)
-    assert [name.rpartition("_")[2] for name in tracks.result.pictures] == ["slip", "path"]
+    assert [name.rpartition("_")[2] for name in tracks.result.pictures] == ["motion", "slip", "path"]

@@ -17,7 +17,7 @@ from terrain.discrepancy.runs import signals_of
 from terrain.discrepancy.verdict import Tier, Value
 from terrain.effects import CHANNELS, effect_named, library_of, vector_of
 from terrain.errors import DataError
-from terrain.estimation.observe import observe_run, with_estimates
+from terrain.estimation.estimate import enriched, estimate_run
 from terrain.extension import region_of
 from terrain.records import Label, RunLog
 from terrain.robots import load_robot
@@ -58,7 +58,7 @@ def test_a_robot_of_which_geometry_and_mass_are_known_is_replayed_explained_and_
     library = [effect_named("effective_track"), effect_named("lever_arm")]
     (cause,) = diagnose_runs(runs, robot, library, None, 0).diagnosis.causes
     assert (cause.name, cause.parameters[0].value) == ("effective_track", pytest.approx(0.4, abs=0.05))
-    assert np.isfinite(with_estimates(observe_run(runs[0], robot, "slip")).streams["estimator"].values).all()
+    assert np.isfinite(enriched(estimate_run(runs[0], robot, "slip")).streams["estimator"].values).all()
 
 
 def test_a_log_of_a_car_has_one_wheel_a_region_and_no_columns_to_exchange():

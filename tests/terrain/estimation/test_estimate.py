@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError
-from terrain.estimation.estimate import estimate_run, summarize
+from terrain.estimation.estimate import enriched, estimate_run, summarize
 from terrain.records import Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 from terrain.simulation.scenario import Faults
-from terrain.simulation.sensors import Gnss
+from terrain.simulation.sensors import Gnss, Poses
 
 ROBOT = load_robot("agrimaro")
 LOST = Faults(camera_lost_s=((10.0, 13.0),), by_chance=False)
@@ -44,9 +44,36 @@ def test_encoders_alone_cannot_observe_slip_and_the_track_reports_it(straight):
     row = summarize(found)
     assert row.slip_true_mean == pytest.approx(0.125, abs=0.004)
     assert row.slip_observable is False
-    assert np.isnan(found.slip.slip_ratio).all()
+    assert np.isnan(found.slip.mean).all()
     assert row.slip_mean == pytest.approx(0.0, abs=0.005)
     assert np.isnan(row.slip_std)
+
+
+@pytest.mark.parametrize(
+    ("robot", "name"),
+    [("agrimaro", "vio15"), ("agrimaro", "slip"), ("orchard_ugv", "tracked"), ("adap2e", "sideslip-multi")],
+)
+def test_any_filter_gives_the_same_record_and_figures_of_the_same_definition(robot, name):
+    """By the truth slip, position and steady motion are what they are, whichever filter found them."""
+    robot = load_robot(robot)
+    soil = "tilled_loam" if robot.drive == "tracked" else "grass"
+    run = simulate_run(robot, soil, "straight", 4, poses=Poses(), duration_s=20.0)
+    found = estimate_run(run, robot, name)
+    row, n = summarize(found), len(found.track.time_s)
+    assert row.finite
+    assert found.status.shape == found.slip.stale.shape == (n,)
+    assert sum(row.status_s.values()) == pytest.approx(np.ptp(found.track.time_s))
+    assert list(row.slip) == list(found.slip.channels) == list(enriched(found).streams["slip"].channels)
+    for name, each in row.slip.items():
+        assert abs(each.mean - each.true_mean) < 0.03, name
+        assert each.nees < 2.0 or name.endswith("_rad"), name
+    if found.slip.ratios.channels:
+        assert row.slip_mean == pytest.approx(row.slip_true_mean, abs=0.03)
+        assert row.steady_s > 5.0
+    assert row.position_rmse_m < 0.5
+    assert (row.n_gated is None) == np.isnan(row.nees) == (found.innovations == {})
+    written = enriched(found).streams["state"].channels
+    assert {"stale_ratio", "observer_code", *(f"std_{name}" for name in found.slip.channels)} <= set(written)
 
 
 def turned(run, angle_rad):
@@ -72,7 +99,7 @@ def test_the_heading_of_the_start_is_found_from_the_drive(angle_rad):
 
 def test_a_receiver_that_never_moved_is_left_out_and_counted():
     found = estimate_run(drive("stand", gnss=Gnss(), duration_s=5.0), ROBOT, "vio15")
-    assert found.table.dropped == {"gnss: heading not observable in this run": 50}
+    assert found.dropped == {"gnss: heading not observable in this run": 50}
     assert "gnss_position" not in found.track.sensors
 
 
@@ -88,15 +115,15 @@ def test_a_camera_outage_of_3_s_makes_slip_stale_and_less_certain_but_close(seed
     true = np.mean(
         [np.interp(time_s, truth.time_s, truth.channel(f"slip_{i}_ratio")) for i in (1, 2, 3)], axis=0
     )
-    assert found.slip.slip_ratio[lost].mean() == pytest.approx(true[lost].mean(), abs=0.015)
-    std = found.slip.slip_std.mean(axis=1)
+    assert found.slip.mean[lost].mean() == pytest.approx(true[lost].mean(), abs=0.015)
+    std = found.slip.std.mean(axis=1)
     assert std[lost][-1] > 2 * std[(time_s > 9.0) & (time_s < 10.0)].max()
     assert (np.diff(std[lost][::25]) > 0).all()
     assert summarize(found).stale_s == pytest.approx(3.1, abs=0.1)
 
     thesis = estimate_run(run, ROBOT, "vio12")
-    assert np.isnan(thesis.slip.slip_ratio[lost]).all()  # it would fall silently to 0
-    assert abs(thesis.blind.slip_ratio[lost][-20:].mean()) < 0.02
+    assert np.isnan(thesis.slip.mean[lost]).all()  # it would fall silently to 0
+    assert abs(thesis.blind.mean[lost][-20:].mean()) < 0.02
 
 
 @pytest.mark.parametrize(("stream", "channel"), [("wheels", "motor_1_radps"), ("steering", "angle_1_rad")])
@@ -106,9 +133,9 @@ def test_a_wheel_without_samples_has_no_slip(straight, stream, channel):
     silent = Stream(sound.time_s, values, sound.channels)
     slip = estimate_run(replace(straight, streams={**straight.streams, stream: silent}), ROBOT, "vio15").slip
     late = slip.time_s > 10.7
-    assert np.isnan(slip.slip_ratio[late, 0]).all()
-    assert np.isfinite(slip.slip_ratio[late, 1:]).all()
-    assert np.isfinite(slip.slip_ratio[(slip.time_s > 5.0) & (slip.time_s < 10.4)]).all()
+    assert np.isnan(slip.mean[late, 0]).all()
+    assert np.isfinite(slip.mean[late, 1:]).all()
+    assert np.isfinite(slip.mean[(slip.time_s > 5.0) & (slip.time_s < 10.4)]).all()
 
 
 def test_unknown_filters_and_tunings_are_refused_in_one_sentence(straight):

@@ -107,7 +107,7 @@ def batch(run, robot=ROBOT, name="vio15", yaw=None):
     table = table.at(track.time_s)
     slip = wheel_slip(track, table, robot)
     desired = {name: track.state(name) for name in ("speed_x_mps", "accel_y_mps2", "yaw_rate_radps")}
-    desired |= {"slip_ratio": slip.slip_ratio, "slip_std": slip.slip_std, "slip_stale": slip.stale}
+    desired |= {"slip_ratio": slip.mean, "slip_std": slip.std, "slip_stale": slip.stale}
     known = [row for row in table.rows if row not in GNSS_ROWS or yaw is not None]
     desired |= dict(zip(known, table.columns(known).T, strict=True))
     desired |= {"mean": track.mean, "reference_age_s": track.reference_age_s}

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pipelines.data.datasets import load_runs
+from terrain.estimation.estimate import estimate_run
 from terrain.estimation.models.observer import ObserverStatus
-from terrain.estimation.observe import observe_run
 from terrain.estimation.stuck import STUCK_AFTER_S, Turns, next_turns
 from terrain.robots import load_robot
 
@@ -82,7 +82,7 @@ def boreal(datasets_dir):
 def test_on_snow_the_bias_is_that_at_rest_and_stuck_is_named(boreal, run_id):
     """At rest the gyro of these runs reads 0.000 rad/s, and the yaw is its integral."""
     run = boreal[run_id]
-    found = observe_run(run, HUSKY, "slip")
+    found = estimate_run(run, HUSKY, "slip")
     track, imu = found.track, run.streams["imu"]
     assert np.abs(track.state("gyro_bias_radps")).max() < 0.005
     gyro = imu.channel("gyro_z_radps")
@@ -90,11 +90,11 @@ def test_on_snow_the_bias_is_that_at_rest_and_stuck_is_named(boreal, run_id):
     last = np.searchsorted(track.time_s, imu.time_s[-1]) - 1
     turned = np.interp(track.time_s[[0, last]], imu.time_s, angle)
     assert np.ptp(np.unwrap(track.state("yaw_rad"))[[0, last]] - turned) < 0.3
-    assert (np.diff(track.time_s)[track.status[:-1] == ObserverStatus.STUCK]).sum() > 10.0
+    assert (np.diff(track.time_s)[found.status[:-1] == ObserverStatus.STUCK]).sum() > 10.0
 
 
 def test_no_run_on_other_ground_is_called_stuck(boreal):
     others = [run for run in boreal.values() if run.run_id.startswith(NOT_STUCK)]
     assert len(others) >= 20
     for run in others:
-        assert not (observe_run(run, HUSKY, "slip").track.status == ObserverStatus.STUCK).any(), run.run_id
+        assert not (estimate_run(run, HUSKY, "slip").status == ObserverStatus.STUCK).any(), run.run_id

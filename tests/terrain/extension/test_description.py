@@ -10,8 +10,8 @@ import yaml
 
 from terrain.effects import PARAMETER, parameters_of
 from terrain.errors import ConfigError, OutsideRegionWarning
+from terrain.estimation.estimate import estimate_run
 from terrain.estimation.live import CHANNELS, make_live_filter
-from terrain.estimation.observe import observe_run
 from terrain.extension import (
     Origin,
     apply_homes,
@@ -209,7 +209,7 @@ def test_a_region_is_written_and_read_and_a_slope_that_was_not_measured_is_none(
     assert (unknown.grade_rad, unknown.terrains) == (None, ())
     warn_outside(husky_runs[0], within("husky", unknown))  # no warning: neither slope nor terrain is known
     simulate_run(robot, "grass", "complex", 0, 3, duration_s=30.0)  # of the same kind, and inside
-    observe_run(husky_runs[0], robot, "slip")
+    estimate_run(husky_runs[0], robot, "slip")
 
 
 def test_simulation_and_filter_warn_outside_once_with_the_numbers(husky_runs):
@@ -220,7 +220,7 @@ def test_simulation_and_filter_warn_outside_once_with_the_numbers(husky_runs):
     )
     for drive in (
         lambda: simulate_run(robot, "grass", "complex", 0, 1, duration_s=30.0),
-        lambda: observe_run(husky_runs[0], robot, "slip"),
+        lambda: estimate_run(husky_runs[0], robot, "slip"),
     ):
         with pytest.warns(OutsideRegionWarning, match=sentence) as caught:
             drive()

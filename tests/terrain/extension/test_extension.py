@@ -222,7 +222,7 @@ def test_a_skid_steer_robot_without_sections_is_corrected_in_its_samples():
 
 #: Where a run as measured meets the robot as described.
 EDGES = {
-    *(f"terrain/estimation/{name}.py" for name in ("estimate", "observe", "tuning")),
+    *(f"terrain/estimation/{name}.py" for name in ("estimate", "tuning")),
     *(f"pipelines/live/{name}.py" for name in ("windows", "classifying", "observer", "pilot")),
     "terrain/slip_learning/learn.py",
 }
@@ -285,7 +285,7 @@ def errors(found):
     """Root mean square errors of speed (m/s) and of steady slip, against the truth of wheels and ground."""
     truth, track = found.run.streams["truth"], found.track
     true = [np.interp(track.time_s, truth.time_s, truth.channel(f"slip_{i}_ratio")) for i in (1, 2, 3)]
-    error = (found.slip.slip_ratio - np.column_stack(true))[found.figures.steady]
+    error = (found.slip.mean - np.column_stack(true))[found.figures.steady]
     return np.array([summarize(found).speed_rmse_mps, np.sqrt(np.nanmean(error**2))])
 
 

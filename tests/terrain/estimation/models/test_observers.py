@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError, DataError
+from terrain.estimation.estimate import enriched, estimate_run, summarize
 from terrain.estimation.filter import FilterModel, FilterSettings, differentiate
 from terrain.estimation.live import make_live_filter
 from terrain.estimation.models.choice import OBSERVERS, make_observer, observers_of
@@ -27,7 +28,6 @@ from terrain.estimation.models.slip_model import (
     read_slip_model,
     write_slip_model,
 )
-from terrain.estimation.observe import observe_run, summarize_observer, with_estimates
 from terrain.kernels import njit
 from terrain.logs.run_folders import read_run, write_run
 from terrain.records import Reading, Stream
@@ -242,41 +242,41 @@ def test_a_robot_has_the_observers_of_its_description():
 
 
 def test_a_run_has_its_estimates_as_streams_and_figures_by_its_truth(straight, tmp_path):
-    found = observe_run(straight, UGV, "tracked")
-    write_run(with_estimates(found), tmp_path)
+    found = estimate_run(straight, UGV, "tracked")
+    write_run(enriched(found), tmp_path)
     run = read_run(tmp_path / "run")
     assert run.filter == "tracked"
     assert run.streams["slip"].channels == ("slip_left_ratio", "slip_right_ratio")
     assert run.streams["slip"].values[-1] == pytest.approx([0.15, 0.15], abs=0.02)
     assert run.streams["estimator"].channels == ("speed_x_mps", "yaw_rate_radps")
     assert {"std_slip_left_ratio", "observer_code", "eta_left_ratio"} <= set(run.streams["state"].channels)
-    learned = with_estimates(observe_run(straight, UGV, "slip-learning"))
+    learned = enriched(estimate_run(straight, UGV, "slip-learning"))
     assert "angle_roll_rad" not in learned.streams["state"].channels  # never excited
-    figures = summarize_observer(found)
+    figures = summarize(found)
     assert figures.slip["slip_left_ratio"].true_mean == pytest.approx(0.15)
     assert set(figures.status_s) <= {"starting", "standing", "ok"}
     assert sum(figures.status_s.values()) == pytest.approx(20.0)
     assert figures.finite
     assert figures.position_rmse_m < 0.05
     assert figures.missing == ()
-    blind = summarize_observer(observe_run(without(straight, "truth"), UGV, "gyrodometry"))
+    blind = summarize(estimate_run(without(straight, "truth"), UGV, "gyrodometry"))
     assert np.isnan(blind.position_rmse_m)
     assert blind.slip == {}
     larger = replace(UGV, effects={"wheel_radius_ratio": -0.15}, effects_cov=np.full((1, 1), np.nan))
-    corrected = observe_run(straight, larger, "tracked")  # for the effect of its robot: no slip is left
-    assert corrected.track.slip[-1] == pytest.approx([0.0, 0.0], abs=0.02)
+    corrected = estimate_run(straight, larger, "tracked")  # for the effect of its robot: no slip is left
+    assert corrected.slip.mean[-1] == pytest.approx([0.0, 0.0], abs=0.02)
 
 
 def test_a_log_that_lacks_something_is_run_and_says_so_or_is_refused(straight):
-    found = observe_run(without(straight, "pose", "gnss", "compass"), UGV, "tracked")
-    assert found.missing == summarize_observer(found).missing == FIX
-    assert set(found.track.status) == {ObserverStatus.STARTING}
-    assert np.isnan(found.track.slip).all()
-    assert np.isfinite(observe_run(without(straight, "imu"), UGV, "gyrodometry").track.mean[:, :3]).all()
+    found = estimate_run(without(straight, "pose", "gnss", "compass"), UGV, "tracked")
+    assert found.missing == summarize(found).missing == FIX
+    assert set(found.status) == {ObserverStatus.STARTING}
+    assert np.isnan(found.slip.mean).all()
+    assert np.isfinite(estimate_run(without(straight, "imu"), UGV, "gyrodometry").track.mean[:, :3]).all()
     wheels = straight.streams["wheels"]
     left = Stream(wheels.time_s, wheels.values[:, :1], wheels.channels[:1])
     with pytest.raises(ConfigError, match="'speed_right_mps' must be among them"):
-        observe_run(replace(straight, streams=dict(straight.streams) | {"wheels": left}), UGV, "tracked")
+        estimate_run(replace(straight, streams=dict(straight.streams) | {"wheels": left}), UGV, "tracked")
 
 
 def test_a_slip_model_is_read_as_it_was_written_and_what_cannot_be_is_refused(tmp_path):

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from terrain.angles import wrapped
+from terrain.estimation.estimate import estimate_run, summarize
 from terrain.estimation.live import live_estimator
 from terrain.estimation.models import slip as module
 from terrain.estimation.models.choice import suitable_filter
 from terrain.estimation.models.observer import ObserverStatus, observe
 from terrain.estimation.models.observer import rows_of as feed_rows
 from terrain.estimation.models.slip import SlipFilter, rows_of_wheels
-from terrain.estimation.observe import observe_run, summarize_observer
 from terrain.kinematics.wheels import rolling_matrix
 from terrain.logs.replay import replay as replayed
 from terrain.records import RunLog, Stream
@@ -225,14 +225,14 @@ def test_a_turn_that_begins_late_leaves_the_bias_alone():
     """By wheels and gyro alone: tyres and soil yield first, and the wheels turn for a while before the robot."""
     robot = load_robot("warthog")
     run = simulate_run(robot, "grass", "survey", 81001, duration_s=18.0)
-    track = observe_run(
+    track = estimate_run(
         replace(run, streams={n: run.streams[n] for n in ("wheels", "imu")}), robot, "slip"
     ).track
     truth, late = run.streams["truth"], track.time_s > 1.0
     for name, true, most in (("gyro_bias_radps", "gyro_bias_z_radps", 2e-3), ("yaw_rad", "yaw_rad", 0.02)):
         error = track.state(name) - np.interp(track.time_s, truth.time_s, truth.channel(true))
         assert np.abs(error)[late].max() < most
-        assert (np.abs(error) < 3.0 * track.std[:, track.states.index(name)])[late].all()
+        assert (np.abs(error) < 3.0 * track.std(name))[late].all()
 
 
 def test_gravity_of_a_slope_is_taken_off_by_the_measured_pitch():
@@ -446,35 +446,34 @@ def test_the_filter_that_suits_is_chosen_by_what_is_measured():
 
 def coverage(found, robot, least_mps=0.2):
     """Return mean error, root mean square error and coverage of 95 % intervals of slips, where the wheels turn."""
-    track, truth = found.track, found.run.streams["truth"]
+    slip, truth = found.slip, found.run.streams["truth"]
     errors, inside = [], []
-    for k, name in enumerate(track.slips):
-        wheel = name.removeprefix("slip_").removesuffix("_ratio")
-        at_s = track.time_s - robot.encoder_lag_s
+    for k, (name, wheel) in enumerate(zip(slip.channels, slip.wheels, strict=True)):
+        at_s = slip.time_s - robot.encoder_lag_s
         true = np.interp(at_s, truth.time_s, truth.channel(name))
         speed = robot.wheel_radius_m * np.interp(at_s, truth.time_s, truth.channel(f"wheel_{wheel}_radps"))
-        error = track.slip[:, k] - true
+        error = slip.mean[:, k] - true
         known = np.isfinite(error) & (np.abs(speed) > least_mps)
         errors.append(error[known])
-        inside.append(np.abs(error[known]) < 1.96 * track.slip_std[known, k])
+        inside.append(np.abs(error[known]) < 1.96 * slip.std[known, k])
     errors, inside = np.concatenate(errors), np.concatenate(inside)
     return errors.mean(), np.sqrt(np.mean(errors**2)), inside.mean()
 
 
 def test_live_equals_log_and_a_robot_of_four_numbers_has_its_slip():
     run = simulate_run(MINE, "grass", "survey", 11, duration_s=20.0, gnss=Gnss())
-    found = observe_run(run, MINE, "slip")
+    found = estimate_run(run, MINE, "slip")
     mean, _, inside = coverage(found, MINE)
     assert abs(mean) < 0.02
     assert inside > 0.85
-    assert summarize_observer(found).reason == ""
+    assert summarize(found).reason == ""
     channels = {name: stream.channels for name, stream in run.streams.items()}
     live = live_estimator(MINE, channels)
     assert live.name == "slip"
     estimates = [estimate for sample in replayed(run) for estimate in live.step(sample.readings)]
     estimates += live.settle(all_of_them=True)
-    np.testing.assert_array_equal([estimate.slip_ratio for estimate in estimates], found.track.slip)
-    np.testing.assert_array_equal([estimate.slip_std for estimate in estimates], found.track.slip_std)
+    np.testing.assert_array_equal([estimate.slip_ratio for estimate in estimates], found.slip.mean)
+    np.testing.assert_array_equal([estimate.slip_std for estimate in estimates], found.slip.std)
 
 
 @pytest.mark.slow
@@ -483,7 +482,7 @@ def test_mean_slip_of_a_skid_steer_robot_with_a_receiver_is_within_a_hundredth(s
     means, inside = [], []
     for seed in range(91500, 91505):
         run = simulate_run(MINE, soil, "survey", seed, duration_s=60.0, vary=True, gnss=Gnss())
-        mean, _, covered = coverage(observe_run(run, MINE, "slip"), MINE)
+        mean, _, covered = coverage(estimate_run(run, MINE, "slip"), MINE)
         means.append(mean)
         inside.append(covered)
     assert np.abs(means).max() < 0.02
