@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
@@ -89,6 +90,10 @@ def write_json(path: Path, result: Any) -> None:
     atomic_write(path, json.dumps(as_json(result), indent=2, allow_nan=False) + "\n")
 
 
+#: What a description says of a value that stands for something, which is of no use where a page shows the value.
+_SPECIAL_VALUE = re.compile(r"; (?:null|NaN|none|empty|infinite|0)\b.*")
+
+
 @dataclass_transform(frozen_default=True)
 @dataclass(frozen=True, repr=False)
 class Result:
@@ -162,8 +167,8 @@ class Result:
             value, about = getattr(self, name), self.about()[name]
             if isinstance(value, tuple) and all(isinstance(each, str) for each in value):
                 value = ", ".join(value)
-            unit = "" if about["unit"] == "1" else about["unit"]
-            rows.append((about["description"], value, about["form"], unit))
+            unit = "" if about["unit"] == "1" else about["unit"].replace("^2", "²")
+            rows.append((_SPECIAL_VALUE.sub("", about["description"]), value, about["form"], unit))
         return rows
 
     def records(self) -> Iterable[Any]:

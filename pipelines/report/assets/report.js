@@ -128,20 +128,23 @@
     const tables = own.map((mark) => [mark.x, mark.y]);
     const data = tables.length ? uPlot.join(tables, tables.map(() => [1])) : [[full.x[0], full.x[1]]];
     for (const _ of drawn) data.push(data[0].map(() => null));
-    const series = [{ label: panel.x_label || figure.x_label || "x", value: (u, v) => written(v) }];
+    const shown = (u, v) => v == null ? "" : written(v);
+    const series = [{ label: panel.x_label || figure.x_label || "x", value: shown }];
     for (const mark of own) {
       const colour = colourOf(mark, mark.number), line = mark.kind === "line";
       series.push({ label: mark.label || " ", stroke: colour, width: line ? 1.4 : 0, dash: mark.dashed ? [6, 4] : undefined,
-        points: { show: !line, size: 6, fill: colour }, paths: line ? undefined : () => null, value: (u, v) => written(v) });
+        points: { show: !line, size: 6, fill: colour }, paths: line ? undefined : () => null, value: shown });
     }
     for (const mark of drawn)
       series.push({ label: mark.label || " ", stroke: colourOf(mark, mark.number), width: 8, points: { show: false }, value: () => "" });
     const ink = variable("--ink"), grid = { stroke: variable("--rule"), width: 1 }, font = "12px system-ui, sans-serif";
+    const counts = panel.marks.every((mark) => isStrip(mark) || mark.x.every((x) => x === null || Number.isInteger(x)));
     const longest = categories ? Math.max(...categories.map(widthOf)) : 0;
     const axes = [
-      { stroke: ink, grid, ticks: grid, font, labelFont: font, labelSize: 18, size: 34, label: panel.x_label || (last ? figure.x_label : "") || undefined },
+      { stroke: ink, grid, ticks: grid, font, labelFont: font, labelSize: 18, size: 34, label: panel.x_label || (last ? figure.x_label : "") || undefined,
+        values: (u, splits) => splits.map(written), ...(counts ? { incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000] } : {}) },
       { stroke: ink, grid: categories ? { show: false } : grid, ticks: grid, font, labelFont: font, labelSize: 18,
-        size: categories ? Math.min(width * 0.42, 22 + longest) : 54, label: first ? undefined : label,
+        size: categories ? Math.min(width * 0.42, 22 + longest) : (u, values) => Math.max(54, 18 + Math.max(0, ...(values || []).map(widthOf))), label: first ? undefined : label,
         values: (u, splits) => categories ? splits.map((i) => shortened(categories[i] ?? "", width * 0.42)) : splits.map(written) },
     ];
     axes[1].show = !thin;

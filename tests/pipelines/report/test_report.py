@@ -6,6 +6,7 @@ import base64
 import json
 import math
 import re
+import shutil
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -130,6 +131,32 @@ def test_a_figure_gives_the_same_bytes_and_a_fragment_has_pictures_and_runs_noth
     assert figure_png(RECALL).startswith(b"\x89PNG")
 
 
+def test_a_legend_names_what_has_a_name_and_ends_with_no_colon(tmp_path):
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if chromium is None:
+        pytest.skip("chromium is not installed")
+    marks = [
+        Line("", [1, 2, 3], [0.1, 0.2, 0.3]),
+        Points("held out", [1, 2], [1.0, 1.1], [0.9, 1.0], [1.1, 1.2]),
+    ]
+    panel = Panel([Strip([(0.0, 1.0, "no correction")]), *marks], "yaw rate (gyro) [rad/s]")
+    file = Report("Title", "Answer.", parts=[Figure("Curve", [panel], x_label="runs")]).save(
+        tmp_path / "a.html"
+    )
+    with playwright.sync_playwright() as started:
+        page = started.chromium.launch(
+            executable_path=chromium, args=["--no-sandbox", "--disable-gpu"]
+        ).new_page()
+        page.goto(file.as_uri())
+        rows = [row.inner_text().strip() for row in page.query_selector_all(".u-series") if row.is_visible()]
+        assert sorted(rows) == ["held out", "no correction"]
+        colon = "(row) => getComputedStyle(row, '::after').content"
+        assert {row.evaluate(colon) for row in page.query_selector_all(".u-series th")} == {"none"}
+        page.hover(".u-over")
+        assert page.query_selector(".u-series").is_visible()
+
+
 @pytest.mark.parametrize("marks", [YAW.panels[0].marks, RECALL.panels[0].marks])
 def test_every_mark_is_drawn(marks):
     """Without its last mark a panel looks different."""
@@ -164,6 +191,7 @@ class Found(Result):
     kind: Literal["a", "b"] = described("which")
     ratio: float = described("of slip", "1", form=".1%")
     points: tuple[Point, ...] = described("each", default=())
+    rise: float = described("of the speed; null where not driven", "m/s^2", default=0.5)
 
 
 def report(result):
@@ -176,7 +204,10 @@ def test_all_that_derives_from_a_result():
     assert str(found) == "25.0\xa0% of husky."
     assert "25.0" in found._repr_html_()
     assert found.as_json()["points"] == [{"x": 0.0, "y": None}]
-    assert found.to_pandas().to_dict("records") == [{"name": "husky", "kind": "a", "ratio": 0.25}]
+    assert found.to_pandas().to_dict("records") == [
+        {"name": "husky", "kind": "a", "ratio": 0.25, "rise": 0.5}
+    ]
+    assert found.pairs("ratio", "rise") == [("of slip", 0.25, ".1%", ""), ("of the speed", 0.5, "", "m/s²")]
     schema = Found.schema()["properties"]
     assert schema["ratio"] == {"description": "of slip", "unit": "1"}
     assert list(schema) == ["doubtful", *found.as_json()]
