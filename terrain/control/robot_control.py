@@ -58,9 +58,9 @@ from terrain.control.turning import SETTINGS as TURN
 from terrain.control.turning import first_state, open_loop, turn_step, turning_of
 from terrain.errors import ConfigError
 from terrain.estimation.clocks import check_channels
-from terrain.estimation.health import SENSORS, SLIP_SENSORS, SOUND, Health
+from terrain.estimation.health import NOT_OF_SLIP, SOUND, Health, HealthMonitor, sensors_of
 from terrain.estimation.live import CHANNELS, LiveEstimate
-from terrain.estimation.stream_health import StreamHealth
+from terrain.estimation.stream_evidence import StreamEvidence
 from terrain.kinematics.commands import wheel_motion
 from terrain.kinematics.wheels import in_wheel_frame, point_velocity
 from terrain.records import Array, Command, Reading
@@ -318,10 +318,8 @@ class Actuation:
         self.off = np.where(goes, now_off, self.off)
 
 
-_OF_SLIP = tuple(SENSORS.index(name) for name in SLIP_SENSORS)
 # Order in which sensors are named, by health: one that steps or freezes takes others with it, which are lost.
 _NAMED_FIRST = (0, 1, 2, 3, 4, 6, 7, 5)
-_GYRO, _SEEN, _SEEN_YAW = (SENSORS.index(name) for name in ("gyro", "camera_speed", "camera_yaw"))
 FRESH_S = 0.5  #: Age of a measured speed over ground up to which a robot counts as slow.
 POSE_STATES = ("position_x_m", "position_y_m", "yaw_rad")  #: Of a filter that path tracking is built on.
 _NOT_TRACKED = TrackReport(math.nan, math.nan, 0.0, TrackStatus.NO_POSE)
@@ -340,7 +338,7 @@ class RobotControl:
 
     Attributes
     ----------
-    health : of each sensor at the last step
+    sensors, health : names of the sensors that are judged, and the health of each at the last step
     target_ratio : target slip in traction that is aimed for; NaN before the first step
 
     Raises
@@ -379,9 +377,13 @@ class RobotControl:
         if states:
             check_channels("wheels", robot.rate_channels, wheels)
         self._n_columns = len(wheels), len(imu)
-        self._streams = StreamHealth(robot, channels, states) if states and not self._angles else None
-        #: names of the sensors that are judged
-        self.sensors = SENSORS if self._streams is None else self._streams.names
+        sensors = sensors_of(robot, channels) if states else ()
+        self._monitor, self.sensors = HealthMonitor(sensors), tuple(sensor.name for sensor in sensors)
+        self._of_slip = [i for i, name in enumerate(self.sensors) if name not in NOT_OF_SLIP]
+        # a filter that estimates the angles of wheels judges by its feed
+        self._evidence = None
+        if states and not self._angles:
+            self._evidence = StreamEvidence(robot, channels, sensors, states)
         self._rates = [wheels.index(channel) for channel in robot.rate_channels if states]
         self._tilt = [imu.index(angle) for angle in ("roll_rad", "pitch_rad") if angle in imu]
         self._gains = thesis_gains(robot) if settings.controller == "thesis" else THESIS_GAINS
@@ -419,9 +421,9 @@ class RobotControl:
         Rates of motors that do not follow their commands are not to be believed, nor sensors that are frozen or have
         jumped: they are replaced by NaN.
         """
-        if self._streams is not None:
-            self._streams.step(time_s, step_or_period(dt_s), readings, seen)
-            self._streams.mask(readings)
+        if self._evidence is not None:
+            known = self._evidence.at(time_s, step_or_period(dt_s), readings, seen)
+            self._evidence.mask(readings, self._monitor.judge(known))
         wheels, imu = (
             reading
             if reading is not None and len(values := reading.values) and values.shape[1] == n
@@ -593,22 +595,17 @@ class RobotControl:
         """Update the health of the sensors; return the place of the least sound, or -1, and its health."""
         if not self._estimates:
             return -1, Health.FRESH
-        if self._streams is not None:
-            self.health = list(self._streams.health)
-        elif seen is None:
-            self.health = [int(Health.LOST)] * len(SENSORS)
-            return 0, Health.LOST
-        else:
-            self.health = seen.health.tolist()
-        health = self.health
+        health = list(self._monitor.health)
+        if seen is not None and self._evidence is None:
+            health = seen.health.tolist()
+        self.health = health
         for i in np.flatnonzero(self._actuation.off).tolist():
             if health[i] == Health.LOST or health[i] < Health.DISAGREES:  # it was taken from the filter
                 health[i] = int(Health.DISAGREES)
-        judged = _OF_SLIP if self._streams is None else range(len(health))
-        worst = max(health[i] for i in judged)
+        worst = max(health[i] for i in self._of_slip)
         if worst <= SOUND:
             return -1, worst
-        place = max(judged, key=lambda i: _NAMED_FIRST[health[i]])
+        place = max(self._of_slip, key=lambda i: _NAMED_FIRST[health[i]])
         return place, health[place]
 
     def _target(self, terrain: str, seen: LiveEstimate | None, dt_s: float) -> TractionTarget:
@@ -631,8 +628,11 @@ class RobotControl:
         if not self._settings.track or seen is None:
             return twist, _NOT_TRACKED
         is_sound = True
-        if self._streams is None:
-            turns, seen_yaw, camera = (self.health[i] for i in (_GYRO, _SEEN_YAW, _SEEN))
+        if self._evidence is None:
+            by_name = dict(zip(self.sensors, self.health, strict=True))
+            turns, seen_yaw, camera = (
+                by_name.get(name, Health.LOST) for name in ("gyro", "camera_yaw", "camera_speed")
+            )
             is_sound = min(turns, seen_yaw) <= SOUND and (camera <= SOUND or camera == Health.LOST)
         ahead, left, yaw = seen.speed_x_mps, seen.speed_y_mps, seen.yaw_rate_radps
         left = left if self._robot.sideways else 0.0

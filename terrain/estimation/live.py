@@ -76,8 +76,8 @@ class LiveEstimate(NamedTuple):
     motor_radps: Array  #: (wheels,) of this sample of the wheels
     current_a: Array
     wheel_speed_mps: Array  #: (wheels,) circumferential speeds of that sample
-    #: (13,) of the sensors of a swerve robot, as :class:`~terrain.estimation.health.Health`, in the order of
-    #: :data:`~terrain.estimation.health.SENSORS`; of others (0,)
+    #: (k,) of the sensors of a swerve robot, as :class:`~terrain.estimation.health.Health`, in the order of
+    #: :func:`~terrain.estimation.health.sensors_of`; of others (0,)
     health: Array
     slip: Array = np.empty(0)  #: of an observer, in the order of its slips, which may be angles
     status: ObserverStatus = ObserverStatus.OK  #: of the estimates of an observer

@@ -178,7 +178,7 @@ class Observer(ABC, _WithMemory):
     kept: Filter | None = (
         None  #: what may be kept over a restart; None of one that starts from its first samples
     )
-    #: of each sensor at the last tick, as :data:`~terrain.estimation.health.SENSORS`; (0,) where none is judged
+    #: of each sensor at the last tick, as :func:`~terrain.estimation.health.sensors_of`; (0,) where none is judged
     health = np.empty(0, np.int8)
 
     @property

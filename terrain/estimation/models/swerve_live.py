@@ -13,7 +13,7 @@ from terrain.errors import ConfigError
 from terrain.estimation import feed
 from terrain.estimation.clocks import Due, SampleQueue, check_channels
 from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, Filter, FilterSettings
-from terrain.estimation.health import HealthMonitor
+from terrain.estimation.health import FeedEvidence, HealthMonitor, sensors_of
 from terrain.estimation.models.observer import Observer, ObserverOutput, ObserverStatus, status_of_use
 from terrain.estimation.models.swerve import make_filter, scheduled
 from terrain.estimation.wheel_slip import STALE_AFTER_S, WheelSlip
@@ -127,24 +127,27 @@ class SwerveObserver(Observer):
 
     rows = feed.ROWS
 
-    def __init__(self, robot: Robot, filter: Filter, source: SwerveFeed) -> None:
+    def __init__(
+        self, robot: Robot, filter: Filter, source: SwerveFeed, channels: Mapping[str, tuple[str, ...]]
+    ) -> None:
         self.kept = self._filter = filter
         self._feed, self._robot, model = source, robot, filter.model
         self.name, self.states = model.name, model.states
         self.slips = tuple(f"slip_{wheel}_ratio" for wheel in robot.wheels)
-        self._monitor = HealthMonitor(robot, model)
+        sensors = sensors_of(robot, channels)
+        self._monitor, self._evidence = HealthMonitor(sensors), FeedEvidence(robot, filter, sensors)
         self._slip, self._region = WheelSlip(robot, self.states), RegionMonitor(robot)
         self._places = [feed.ROWS.index(row) for row in model.rows]
         self._turn = self.states.index("yaw_rate_radps")
-        self._memories = [memory.view(np.uint8) for memory in (filter.state, self._monitor.memory)]
 
     def step(self, row: Array, _: float) -> ObserverOutput:
         """Take the row of the feed's last tick."""
         source, filter_, time_s, numbers = self._feed, self._filter, self._feed.last_s, self._feed.numbers
         now = scheduled(filter_.model, numbers[:, : len(feed.ROWS)], numbers[:, len(feed.ROWS) :])
         filter_.step(time_s, row[self._places], *(None if part is None else part[0] for part in now))
-        self._monitor.judge(time_s, source.wheels, source.motor_radps, numbers, source.memory, filter_.state)
-        self.health = self._monitor.health.copy()
+        measured = source.wheels, source.motor_radps, numbers[0], source.memory
+        known = self._evidence.at(time_s, *measured, self._monitor.health)
+        self.health = np.array(self._monitor.judge(known), np.int8)
         mean, std = filter_.mean.copy(), np.sqrt(filter_.cov.diagonal())
         self.reference_age_s = age_s = filter_.reference_age_s
         speeds = self._robot.wheel_speeds_mps(numbers[:, : len(self._robot.wheels)])
@@ -182,7 +185,7 @@ class SwerveObserver(Observer):
     @property
     def health_names(self) -> dict[str, str]:
         """Health of each sensor by name."""
-        return self._monitor.names
+        return self._monitor.by_name
 
     def ahead(self, mean: Array, dt_s: float) -> Array:
         """Return the mean (d,) predicted to a later time."""
@@ -193,13 +196,13 @@ class SwerveObserver(Observer):
 
     def snapshot(self) -> Any:
         """Return all that is remembered, for :meth:`restore`."""
-        return [memory.copy() for memory in self._memories], self._region.memory
+        state = self._filter.state.view(np.uint8).copy()  # bytes are copied at once
+        return state, self._monitor.health, self._evidence.memory, self._region.memory
 
     def restore(self, memory: Any) -> None:
         """Go back to a snapshot."""
-        memories, self._region.memory = memory
-        for one, snapshot in zip(self._memories, memories, strict=True):
-            one[:] = snapshot
+        state, self._monitor.health, self._evidence.memory, self._region.memory = memory
+        self._filter.state.view(np.uint8)[:] = state
 
 
 def swerve_live(
@@ -217,4 +220,4 @@ def swerve_live(
     robot.require("motors", "steering", "sensors")
     filter_ = Filter(model, SETTINGS)
     source = SwerveFeed(robot, filter_, channels, initial_yaw_rad)
-    return SwerveObserver(robot, filter_, source), source
+    return SwerveObserver(robot, filter_, source, channels), source

@@ -16,7 +16,7 @@ from terrain.control.slip_table import CurveEntry, load_slip_table
 from terrain.control.switching import OutputStatus, TerrainEstimate, TerrainSource
 from terrain.control.traction import SETTINGS, TractionStatus
 from terrain.errors import ConfigError
-from terrain.estimation.health import SENSORS, Health
+from terrain.estimation.health import Health
 from terrain.logs.replay import replay
 from terrain.records import Reading, Sample
 from terrain.robots import load_robot
@@ -97,7 +97,7 @@ def test_a_wheel_that_does_not_follow_its_command_disagrees_unless_another_contr
             readings["wheels"] = Reading(readings["wheels"].time_s, values)
         live.step(sample._replace(readings=readings))
     assert (live.health["wheel_2"] == "disagrees") is follows
-    assert (live.estimate.health[SENSORS.index("wheel_2")] == Health.LOST) == follows
+    assert (live.estimate.health[live.control.sensors.index("wheel_2")] == Health.LOST) == follows
 
 
 def test_a_classifier_whose_probability_never_suffices_is_reported_and_one_that_ends_not_believed_for_long():

@@ -16,7 +16,7 @@ from terrain.control.robot_control import (
     uphill_mps2,
 )
 from terrain.control.slip_table import load_slip_table
-from terrain.estimation.health import SENSORS, Health
+from terrain.estimation.health import Health
 from terrain.estimation.live import CHANNELS, make_live_filter
 from terrain.records import Reading
 from terrain.robots import load_robot
@@ -55,9 +55,9 @@ def test_gravity_decelerates_uphill_in_any_direction(standing, axis, tilt_rad, s
 def test_the_sensor_is_named_that_takes_others_with_it(standing, statuses, named, health):
     seen, states = standing
     control = RobotControl(ROBOT, load_slip_table(), DEFAULT_SETTINGS, states)
-    judged = np.array([statuses.get(name, Health.FRESH) for name in SENSORS], dtype=np.int8)
+    judged = np.array([statuses.get(name, Health.FRESH) for name in control.sensors], dtype=np.int8)
     place, status = control._judge(seen._replace(health=judged))
-    assert (SENSORS[place] if place >= 0 else None, status) == (named, health)
+    assert (control.sensors[place] if place >= 0 else None, status) == (named, health)
 
 
 class Curve:

@@ -10,7 +10,7 @@ from terrain.control.controllers import make_controller
 from terrain.control.fault_drives import START, STOP, make_fault_situation
 from terrain.control.slip_table import load_slip_table
 from terrain.estimation.clocks import Clocks
-from terrain.estimation.health import SENSORS, Health
+from terrain.estimation.health import Health, sensors_of
 from terrain.estimation.live import CHANNELS, make_live_filter
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
@@ -21,6 +21,7 @@ from terrain.simulation.scenario import Faults
 ROBOT = load_robot("agrimaro")
 CATALOGUE = fault_catalogue(ROBOT)
 START_S, END_S = 4.0, 7.0
+SENSORS = [sensor.name for sensor in sensors_of(ROBOT, CHANNELS)]
 WHEELS, STEERS = SENSORS[:3], SENSORS[3:6]
 IMU, CAMERA = SENSORS[6:10], SENSORS[10:]
 

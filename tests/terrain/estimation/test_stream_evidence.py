@@ -5,22 +5,27 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from terrain.estimation.health import Health
-from terrain.estimation.stream_health import BELIEVED_S, StreamHealth
+from terrain.estimation.health import Health, HealthMonitor, sensors_of
+from terrain.estimation.stream_evidence import BELIEVED_S, StreamEvidence, Turns
 from terrain.kinematics.logged_wheels import sensor_channels
 from terrain.records import Reading
 from terrain.robots import load_robot
 
 ROBOT = load_robot("husky")
 CHANNELS = sensor_channels(ROBOT)
+SENSORS = sensors_of(ROBOT, CHANNELS)
 DT_S, SPEED_MPS, FAULT_S = 0.02, 0.8, 4.0
 EVERY = {"wheels": 1, "imu": 1, "odometry": 2, "gnss": 5}  # steps from sample to sample
 STD = {"speed_x_mps": 0.02, "velocity_x_mps": 0.03, "position_x_m": 0.02, "pitch_rad": 0.01}
 
 
-def judged(change=lambda name, time_s, row: row, length_s=6.0, age_s=lambda time_s: 0.0, seed=0):
-    """The health of each sensor at each step of a steady drive, whose samples ``change`` makes others of, or none."""
-    rng, judge, found = np.random.default_rng(seed), StreamHealth(ROBOT, CHANNELS), []
+def judged(change=lambda name, time_s, row: row, length_s=6.0, age_s=lambda time_s: 0.0, seed=0, **given):
+    """The health of each sensor at each step of a steady drive, whose samples ``change`` makes others of, or none.
+
+    ``given`` is of the estimate in place of what it is.
+    """
+    rng, found = np.random.default_rng(seed), []
+    source, monitor = StreamEvidence(ROBOT, CHANNELS, SENSORS), HealthMonitor(SENSORS)
     for k in range(round(length_s / DT_S)):
         time_s, readings = k * DT_S, {}
         for name, channels in CHANNELS.items():
@@ -38,9 +43,9 @@ def judged(change=lambda name, time_s, row: row, length_s=6.0, age_s=lambda time
             if row is not None:
                 readings[name] = Reading(np.array([time_s]), row[None])
         motion = {"time_s": time_s, "reference_age_s": age_s(time_s), "speed_x_mps": SPEED_MPS}
-        motion |= {"wheel_speed_mps": np.full(2, 0.9), "accel_x_mps2": 0.1 * rng.standard_normal()}
-        found.append(list(judge.step(time_s, DT_S, readings, SimpleNamespace(**motion))))
-    return dict(zip(judge.names, np.array(found).T, strict=True))
+        motion |= {"wheel_speed_mps": np.full(2, 0.9), "accel_x_mps2": 0.1 * rng.standard_normal()} | given
+        found.append(monitor.judge(source.at(time_s, DT_S, readings, SimpleNamespace(**motion))))
+    return dict(zip(monitor.names, np.array(found).T, strict=True))
 
 
 def added(stream, channel, amount, until_s=np.inf):
@@ -133,6 +138,71 @@ def test_an_outlier_a_float_solution_and_what_never_came_are_no_faults():
         assert (health != Health.FRESH).sum() <= 2, name
 
 
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"wheel_speed_mps": np.full(2, np.nan)},
+        {"accel_x_mps2": np.nan},
+        {"wheel_speed_mps": np.full(2, np.nan), "accel_x_mps2": np.nan},
+    ],
+    ids=["no wheels", "no accelerometer", "neither"],
+)
+@pytest.mark.parametrize(("stream", "channel"), [("odometry", "speed_x_mps"), ("gnss", "velocity_x_mps")])
+def test_a_speed_that_jumps_is_named_whatever_there_is_to_compare_it_with(stream, channel, given):
+    sensor = "camera_speed" if stream == "odometry" else "gnss_speed"
+    found = judged(added(stream, channel, 1.0), **given)[sensor]
+    assert (found[: round(FAULT_S / DT_S)] == Health.FRESH).all()
+    assert (found[round((FAULT_S + 0.3) / DT_S) :] == Health.STEPPED).all()
+
+
+def coarse(alone):
+    """Rates of wheels that turn evenly and are rounded, from the fault on; or of the left one only."""
+
+    def change(name, time_s, row):
+        if name == "wheels" and time_s >= FAULT_S:
+            row[: 1 if alone else 2] = 0.8
+        return row
+
+    return change
+
+
+def test_rates_that_are_rounded_repeat_themselves_on_wheels_that_turn_evenly_and_a_wheel_alone_is_frozen():
+    found = judged(coarse(alone=False))
+    assert all((found[wheel] == Health.FRESH).all() for wheel in SENSORS_OF["wheels"])
+    found = judged(coarse(alone=True))
+    assert (found["wheel_left"][round((FAULT_S + 0.3) / DT_S) :] == Health.FROZEN).all()
+    assert (found["wheel_right"] == Health.FRESH).all()
+
+
+@pytest.mark.parametrize("moving", [True, False])
+def test_wheels_that_measure_nothing_but_zeros_are_frozen_on_a_robot_that_moves(moving):
+    def zeros(name, time_s, row):
+        return 0.0 * row if name == "wheels" and time_s >= FAULT_S else row
+
+    found = judged(zeros, speed_x_mps=SPEED_MPS if moving else 0.0, wheel_speed_mps=np.zeros(2))
+    late = found["wheel_left"][round((FAULT_S + 0.2) / DT_S) :]
+    assert (late == (Health.FROZEN if moving else Health.FRESH)).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_gyro_that_turns_otherwise_than_the_wheels_is_named_within_a_quarter_of_a_second(seed):
+    found = judged(added("imu", "gyro_z_radps", 0.1, FAULT_S + 1.0), seed=seed)
+    for name in ("gyro", *SENSORS_OF["wheels"]):
+        acts = found[name][round((FAULT_S + 0.25) / DT_S) : round((FAULT_S + 1.0) / DT_S)]
+        assert (acts == Health.DISAGREES).all(), name
+        assert (found[name][round((FAULT_S + 1.25) / DT_S) :] == Health.FRESH).all(), name
+
+
+def test_a_robot_that_turns_later_than_its_wheels_and_by_less_is_no_fault():
+    turns, rng = Turns(), np.random.default_rng(0)
+    turn = 0.0
+    for k in range(600):
+        wheels = 0.8 * (200 <= k < 400)
+        turn += (0.8 * wheels - turn) * DT_S / 0.3
+        turns = turns.after(turn + 0.01 * rng.standard_normal(), wheels + 0.02 * rng.standard_normal(), DT_S)
+        assert turns.apart_s == 0.0, k
+
+
 def test_references_that_the_filter_does_not_believe_are_gated():
     found = judged(age_s=lambda time_s: max(time_s - 2.0, 0.0))
     assert all((found[name][-20:] == Health.GATED).all() for name in ("camera_speed", "gnss_speed"))
@@ -140,16 +210,16 @@ def test_references_that_the_filter_does_not_believe_are_gated():
 
 
 def test_what_is_frozen_or_has_jumped_is_kept_from_the_filter_and_nothing_else():
-    judge = StreamHealth(ROBOT, CHANNELS)
+    monitor = HealthMonitor(SENSORS)
     for sensor, health in (
         ("tilt", Health.STEPPED),
         ("gnss_speed", Health.FROZEN),
         ("accel", Health.DISAGREES),
     ):
-        judge.health[judge.names.index(sensor)] = health
+        monitor.health[monitor.names.index(sensor)] = health
     given = {name: Reading(np.zeros(1), np.ones((1, len(channels)))) for name, channels in CHANNELS.items()}
     readings = dict(given, odometry=Reading(np.zeros(1), np.ones((1, 5))))  # of another robot: left as it is
-    judge.mask(readings)
+    StreamEvidence(ROBOT, CHANNELS, SENSORS).mask(readings, monitor.health)
     masked = {
         name: [CHANNELS[name][i] for i in np.flatnonzero(np.isnan(reading.values[0]))]
         for name, reading in readings.items()
