@@ -200,10 +200,9 @@ def limits_of(run: RunLog, robot: Robot, with_effects: bool, stuck: list[str]) -
 
 def report(result: SimulatedRuns) -> Report:
     """Return how much was simulated."""
-    in_all = "of" if result.n_runs == 1 else "with, in all,"
     return Report(
         f"Simulated runs of {result.robot}",
-        f"{plural(result.n_runs, 'run')} {in_all} {result.duration_s:.0f} s, written to {result.out}.",
+        f"{plural(result.n_runs, 'run')}, {result.duration_s:.0f} s in all, written to {result.out}.",
         parts=[Text(sentence) for sentence in result.limits],
         next_step=f"terrain inspect {result.out}",
     )

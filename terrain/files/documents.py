@@ -26,6 +26,19 @@ if TYPE_CHECKING:
 Document = TypeVar("Document", bound="BaseModel")
 
 
+SPELLINGS = {
+    "m/s": "mps",
+    "m/s^2": "mps2",
+    "m/s²": "mps2",
+    "rad/s": "radps",
+    "N": "n",
+    "Nm": "nm",
+    "A": "a",
+    "V": "v",
+}
+"""Units as they are usually written, beside those that keys end in."""
+
+
 def numbers(place: str, entries: Mapping[str, Any], lows: Mapping[str, float | None]) -> dict[str, float]:
     """Return the numbers of some keys, each in the unit that its key ends in; ``lows`` as of :func:`number`."""
     found = {}
@@ -48,7 +61,7 @@ def number(
     without one not above zero, or above ``high``.
     """
     check_keys(place, entry, ["value", "unit", "source"], optional=(also,))
-    if entry["unit"] != unit:
+    if entry["unit"] != unit and SPELLINGS.get(str(entry["unit"])) != unit:
         raise ConfigError(f"{place} has the unit {shown(entry['unit'])}, {unit!r} is required")
     if not isinstance(entry["source"], str) or not entry["source"].strip():
         raise ConfigError(f"{place} has no source: say where the number is from, or 'assumed'")

@@ -39,7 +39,7 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
 
-from terrain.errors import ConfigError, LogError, library
+from terrain.errors import ConfigError, LogError
 from terrain.files.documents import accepted, read_yaml
 from terrain.files.names import (
     check_name,
@@ -538,7 +538,8 @@ def local_metres(
     >>> local_metres(np.radians([45.0, 45.001]), np.radians([7.0, 7.0]))[1, 1].round(2)
     np.float64(111.13)
     """
-    pymap3d = library("pymap3d", "latitude and longitude need the package pymap3d", "logs")
+    import pymap3d
+
     known = np.isfinite(latitude_rad) & np.isfinite(longitude_rad)
     if not known.any():
         raise LogError("no latitude and longitude are known")

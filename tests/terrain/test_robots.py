@@ -228,6 +228,10 @@ def test_a_car_is_described_by_six_numbers_and_lists_what_is_missing_at_once(tmp
         assert key in car.assumed
     # half of the weight on each axle, a car turns as its geometry says
     assert car.understeer_s2pm == pytest.approx(0.0, abs=1e-12)
+    written = yaml.safe_load(path.read_text())
+    written["speed_max_mps"]["unit"] = "m/s"  # as units are usually written
+    path.write_text(yaml.safe_dump(written))
+    assert load_robot(path).speed_max_mps == car.speed_max_mps
     path.write_text(yaml.safe_dump({"name": "car", "drive": "bicycle", "mass_kg": full["mass_kg"]}))
     with pytest.raises(
         ConfigError, match=r"keys 'wheel_radius_m', 'track_m', .* 'speed_max_mps' are missing"

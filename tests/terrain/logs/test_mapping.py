@@ -11,6 +11,7 @@ import numpy as np
 import openpyxl
 import pytest
 import yaml
+from pymap3d import enu2geodetic
 from scipy.io import savemat
 
 from pipelines.data.convert import Settings as ConvertSettings
@@ -233,10 +234,8 @@ def test_cells_of_a_spreadsheet_that_are_no_numbers_are_refused_or_counted(tmp_p
 def test_a_missing_package_is_one_sentence(tmp_path, read, monkeypatch):
     write_hdf5(tmp_path / "drive.mat", {"t": T, "wz": T})
     write_sheet(tmp_path / "drive.xlsx", [("t", "wz"), *zip(T, T, strict=True)])
-    placed = {"position": {"latitude": "t", "longitude": "t"}}
     for package, stream in (
         ("h5py", imu_of("drive.mat")),
-        ("pymap3d", imu_of("drive.xlsx", **placed)),
         ("openpyxl", imu_of("drive.xlsx")),
     ):
         monkeypatch.setitem(sys.modules, package, None)
@@ -269,7 +268,6 @@ def test_latitude_and_longitude_become_metres_of_the_first_fix_or_an_origin(tmp_
 
 def test_the_worked_mapping_of_an_rtk_log_in_the_docs_reads_one(tmp_path):
     """Truth of a drive, written as a receiver, an IMU and encoders write it, comes back; codes are fixes."""
-    enu2geodetic = pytest.importorskip("pymap3d").enu2geodetic
     document = (ROOT / "docs" / "mapping.md").read_text().partition("## A log of an RTK receiver")[2]
     (tmp_path / "rtk.yaml").write_text(document.split("```yaml\n")[1].partition("```")[0])
     t = np.arange(0.0, 40.0, 0.1)
