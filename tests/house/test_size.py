@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MAX_LINES = {"terrain": 57_724, "features": 2_755, "pipelines": 20_146, "tests": 51_631}
+MAX_LINES = {"terrain": 57_738, "features": 2_755, "pipelines": 20_145, "tests": 51_633}
 """Lines of Python, docstrings included."""
 
 
