@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.estimation.feed import LIVELY, LONGER, MOVING_MPS, SIGNALS
+from terrain.estimation.feed import FIRST_WHEEL, LIVELY, LONGER, MOVING_MPS, REPEATED, SIGNALS
 from terrain.estimation.health import (
     AT_REST_MPS,
     COMPARED_S,
@@ -47,11 +47,11 @@ JUMPS, JUMP_STD, SCATTER_MPS, N_SCATTER = 5.0, 4.5, 0.12, 25.0
 N_GAINED = 32
 REST_SCATTER_MPS = 0.04  #: The median change of a speed of a robot that stands.
 SIGNED_MPS = 0.1  #: A robot that is slower may drive in either direction.
-#: Gyro against wheels: memory of what they are apart by, of the wheels' turn, which the body follows later, and of what
-#: is usual; apart by more than the last, and a part of the turn, is a gyro or a side that measures something else.  On
-#: rough ground the sides of a robot that drives straight scatter by 0.015 rad/s behind the first memory.
-TURN_S, FOLLOWS_S, USUAL_S, TURN_RADPS, TURN_RATIO = 0.1, 0.5, 5.0, 0.06, 0.5
-OUTLIER_RADPS = 0.25  #: One sample that is further apart moves the first memory by no more than this would.
+#: Gyro against wheels: memories of what they are apart by, and of the wheels' turn, which the body follows later; of
+#: what is usual.  Further apart than the last number, than so many times its median, and than a part of the turn is a
+#: gyro or a side that measures something else: the median is 0.005 rad/s on smooth ground, and 0.03 on rough one.
+TURNS_S, FOLLOWS_S, USUAL_S, TURN_JUMPS, TURN_RATIO, TURN_RADPS = (0.1, 0.5), 0.5, 5.0, 7.0, 0.5, 0.06
+OUTLIER_RADPS = 0.25  #: One sample that is further apart moves a memory by no more than this would.
 _SPEEDS = ("camera_speed", "lidar_speed", "gnss_speed")
 _REFERENCES = ("odometry", "lidar", "pose", "gnss")
 
@@ -59,19 +59,20 @@ _REFERENCES = ("odometry", "lidar", "pose", "gnss")
 class _Run:
     """How long values have repeated themselves to the last bit, and for how long they do by nature."""
 
-    def __init__(self) -> None:
+    def __init__(self, most_s: float) -> None:
+        self.most_s = most_s  #: as long as a run that was called frozen may count
         self.value: list[float] = []
         self.stamp_s = self.changed_s = math.nan
         self.longest_s, self.n_same, self.varies, self.was_frozen = 0.0, 0, False, False
 
     def take(self, stamp_s: float, value: list[float], moves: bool) -> None:
-        """Take a sample; a run that was called frozen shows no more than the least one of what is natural."""
+        """Take a sample."""
         if value == self.value:
             self.n_same += 1
         else:
             if moves and self.n_same:
                 run_s = self.stamp_s - self.changed_s
-                self.longest_s = max(self.longest_s, min(run_s, REPEATED_S) if self.was_frozen else run_s)
+                self.longest_s = max(self.longest_s, min(run_s, self.most_s) if self.was_frozen else run_s)
             self.varies |= bool(self.value)
             self.changed_s, self.n_same, self.was_frozen = stamp_s, 0, False
         self.value, self.stamp_s = value, stamp_s
@@ -88,7 +89,8 @@ class _Seen:
 
     def __init__(self, sensor: Sensor, columns: list[int]) -> None:
         self.sensor, self.columns, self.is_reference = sensor, columns, sensor.stream in _REFERENCES
-        self.run, self.value, self.shown = _Run(), np.empty(0), np.zeros(2)
+        self.run = _Run(math.inf if sensor.stream == "wheels" else REPEATED_S)
+        self.value, self.shown = np.empty(0), np.zeros(2)
         self.came_s, self.jumped_s, self.period_s, self.apart = math.nan, math.nan, 0.0, 0.0
         self.scatter = self.usual = SCATTER_MPS
         self.jumped, self.n_after = np.zeros(1), 0
@@ -102,15 +104,16 @@ class _Seen:
 
 
 class Turns(NamedTuple):
-    """Gyro against the wheels of a robot that skids: low-passed and usual difference, turn of the wheels, times.
+    """Gyro against the wheels of a robot that skids.
 
-    They are apart by ``a = w - k (u_r - u_l) / B``, with the turn that is left of that of the wheels by the filter.
+    They are apart by ``a = w - k (u_r - u_l) / B``, with the part k of the wheels' turn that is left by the filter.
     """
 
-    apart_radps: float = math.nan
+    apart_radps: Array = np.full(2, math.nan)  #: behind each memory
+    scatter_radps: Array = np.full(2, TURN_RADPS / TURN_JUMPS)
     usual_radps: float = math.nan
-    wheels_radps: float = math.nan
-    driven_s: float = 0.0
+    wheels_radps: float = math.nan  #: low-passed
+    known_s: float = 0.0
     apart_s: float = 0.0  #: for which they have been apart as they are not by nature
 
     def after(self, gyro_radps: float, wheels_radps: float, dt_s: float) -> Turns:
@@ -118,17 +121,20 @@ class Turns(NamedTuple):
         apart = gyro_radps - wheels_radps
         if math.isnan(apart):
             return self
-        if math.isnan(self.apart_radps) or self.apart_s > BELIEVED_S:
-            return Turns(apart, apart, wheels_radps)
-        fast, late, slow = (-math.expm1(-dt_s / time_s) for time_s in (TURN_S, FOLLOWS_S, USUAL_S))
-        apart = self.apart_radps + fast * min(max(apart - self.apart_radps, -OUTLIER_RADPS), OUTLIER_RADPS)
+        if math.isnan(self.usual_radps) or self.apart_s > BELIEVED_S:
+            return Turns(np.full(2, apart), self.scatter_radps, apart, wheels_radps)
+        late, slow = (-math.expm1(-dt_s / time_s) for time_s in (FOLLOWS_S, USUAL_S))
+        gap = np.clip(apart - self.apart_radps, -OUTLIER_RADPS, OUTLIER_RADPS)
+        memories = self.apart_radps - np.expm1(-dt_s / np.array(TURNS_S)) * gap
         behind = self.wheels_radps + late * (wheels_radps - self.wheels_radps)
-        beyond, driven_s = abs(apart - self.usual_radps), self.driven_s + dt_s
-        limit = abs(wheels_radps - behind) + TURN_RATIO * min(abs(wheels_radps), abs(gyro_radps))
-        if beyond > (0.5 * TURN_RADPS if self.apart_s else TURN_RADPS + limit):
-            return Turns(apart, self.usual_radps, behind, driven_s, self.apart_s + dt_s)
-        usual = self.usual_radps + max(slow, dt_s / driven_s) * (apart - self.usual_radps)
-        return Turns(apart, usual, behind, driven_s)
+        beyond, known_s = np.abs(memories - self.usual_radps), self.known_s + dt_s
+        scatter = self.scatter_radps * np.exp(slow * np.sign(beyond - self.scatter_radps))
+        limit = np.maximum(TURN_JUMPS * self.scatter_radps, TURN_RADPS)
+        turning = abs(wheels_radps - behind) + TURN_RATIO * min(abs(wheels_radps), abs(gyro_radps))
+        if (beyond > limit + turning).any() or (self.apart_s and beyond[0] > 0.5 * limit[0]):
+            return Turns(memories, scatter, self.usual_radps, behind, known_s, self.apart_s + dt_s)
+        usual = self.usual_radps + max(slow, dt_s / known_s) * (float(memories[0]) - self.usual_radps)
+        return Turns(memories, scatter, usual, behind, known_s)
 
 
 class StreamEvidence:
@@ -164,7 +170,7 @@ class StreamEvidence:
             for one in sensors
             for places in [list(channels[one.stream])]
         ]
-        self._n_rates, self._all_wheels = len(robot.rate_channels), _Run()
+        self._n_rates, self._all_wheels = len(robot.rate_channels), _Run(REPEATED_S)
         self._travelled_m, self._ahead, self._sideways = 0.0, 1.0, robot.sideways
         delays = {"gnss": "gnss_delay_s", **dict.fromkeys(("odometry", "lidar"), "pose_delay_s")}
         self._delays = {stream: states.index(name) for stream, name in delays.items() if name in states}
@@ -308,19 +314,20 @@ class StreamEvidence:
         ages_s = age_s, LATE_PERIODS * seen.period_s or math.inf, lost_s
         if not age_s <= lost_s:
             return Evidence(*ages_s)
-        is_long = run.is_long and (moves or run.was_frozen)  # at rest, too, until it changes
-        if (
-            sensor.stream == "steering"
-        ):  # an angle may stay; one that may not is seen not to follow its command
-            is_long = False
-        elif sensor.stream == "wheels":
-            turns, others = (
-                bool(seen.value.any()),
+        if sensor.stream == "wheels":
+            others, turns = (
                 [one for one in self._seen[: self._n_rates] if one is not seen],
+                bool(seen.value.any()),
             )
-            is_long &= turns and any(one.run.n_same <= LIVELY for one in others)
-            is_long |= whole.is_long and len(whole.value) > self._n_rates and (is_fast or (moves and turns))
-        run.was_frozen |= is_long
+            is_long = run.is_long and run.n_same >= REPEATED[FIRST_WHEEL] and moves and turns
+            is_long &= any(one.run.n_same <= LIVELY for one in others)
+            if any(one.value.any() and one.run.n_same >= REPEATED[FIRST_WHEEL] for one in others):
+                run.was_frozen = False  # it turns as evenly as another
+            whole.was_frozen |= whole.is_long and len(whole.value) > self._n_rates
+            is_long |= whole.was_frozen and (is_fast or (moves and turns))
+        else:  # a steering angle that may not stay is seen not to follow its command
+            is_long = run.is_long and moves and sensor.stream != "steering"
+        run.was_frozen |= is_long  # at rest, too, until it changes
         is_frozen = run.was_frozen and run.n_same > 0
         has_jumped = bool(seen.jumped.any()) and seen.n_after >= N_JUMPED - 1
         disagrees = abs(seen.apart) > max(DISAGREES_MPS, JUMPS * seen.usual)

@@ -174,6 +174,18 @@ def test_rates_that_are_rounded_repeat_themselves_on_wheels_that_turn_evenly_and
     assert (found["wheel_right"] == Health.FRESH).all()
 
 
+def test_rounded_rates_of_a_few_hertz_that_change_together_are_no_fault(monkeypatch):
+    monkeypatch.setitem(EVERY, "wheels", 8)
+
+    def change(name, time_s, row):
+        if name == "wheels":
+            row[:2] = 0.8 if time_s % 4.0 < 2.0 else 0.82
+        return row
+
+    found = judged(change, length_s=12.0)
+    assert all((found[wheel][round(1.0 / DT_S) :] == Health.FRESH).all() for wheel in SENSORS_OF["wheels"])
+
+
 @pytest.mark.parametrize("moving", [True, False])
 def test_wheels_that_measure_nothing_but_zeros_are_frozen_on_a_robot_that_moves(moving):
     def zeros(name, time_s, row):
@@ -191,6 +203,16 @@ def test_a_gyro_that_turns_otherwise_than_the_wheels_is_named_within_a_quarter_o
         acts = found[name][round((FAULT_S + 0.25) / DT_S) : round((FAULT_S + 1.0) / DT_S)]
         assert (acts == Health.DISAGREES).all(), name
         assert (found[name][round((FAULT_S + 1.25) / DT_S) :] == Health.FRESH).all(), name
+
+
+def test_rough_ground_that_turns_the_robot_to_and_fro_is_no_fault_once_it_is_known():
+    """A yaw rate of 0.05 rad/s, correlated over a tenth of a second, as a Husky has on sandy loam."""
+    turns, rng, rate, named = Turns(), np.random.default_rng(0), 0.0, []
+    for _ in range(3000):
+        rate += -0.2 * rate + 0.03 * rng.standard_normal()
+        turns = turns.after(rate, 0.01 * rng.standard_normal(), DT_S)
+        named.append(turns.apart_s > 0.0)
+    assert np.mean(named[500:]) < 0.01
 
 
 def test_a_robot_that_turns_later_than_its_wheels_and_by_less_is_no_fault():
