@@ -207,7 +207,7 @@ def estimate_run(
         name,
         track,
         slip,
-        np.where(slip.stale, ObserverStatus.PREDICTED, ObserverStatus.OK),
+        swerve.statuses(model, track.use, table.z, track.reference_age_s),
         np.where(table.columns(driven.wheel_rows) < 0.0, -1.0, 1.0),
         has_gnss,
         {**table.dropped, **track.dropped},
@@ -244,7 +244,7 @@ def _observed(run: RunLog, robot: Robot, name: str, slip_model: SlipModel | None
         found.status,
         rolling,
         "position_x_m" in observer.rows or observer.in_world,
-        dropped,
+        {**dropped, **observer.dropped},
         tuple(row for k, row in enumerate(observer.rows) if not np.isfinite(rows[:, k]).any()),
         "" if np.isfinite(slip.mean).any() else observer.reason,
     )

@@ -74,15 +74,18 @@ from terrain.estimation.feed import (
     GNSS_ROWS,
     GROUND_SLIP,
     GROWTH,
+    REST_TWIST,
     ROWS,
     SEEN_AGE,
     UNSEEN_AFTER_S,
     VIBRATION,
 )
 from terrain.estimation.filter import FilterModel
+from terrain.estimation.models.observer import ObserverStatus
+from terrain.estimation.wheel_slip import STALE_AFTER_S
 from terrain.kernels import inner, njit
 from terrain.kinematics.wheels import in_wheel_frame, point_velocity
-from terrain.records import Array
+from terrain.records import GATED, REOPENED, Array
 from terrain.robots import Robot, SwerveRobot, as_drive
 
 FILTERS = ("encoder12", "vio12", "vio15")  #: Names of the filters.
@@ -417,3 +420,25 @@ def scheduled(
     turned = 3.0 * (SHAKEN_TURN_S * shaken[:, 0]) ** 2 + 2.0 * CHANGED_RATIO**2 * changes
     walk[:, _W] = turned / float((model.params[_PLACES:_CAMERA_X] ** 2).sum())
     return variance, walk, growth
+
+
+def statuses(model: FilterModel, use: Array, z: Array, age_s: Array) -> Array:
+    """Return what the estimates are worth at ticks (n,), in the order in which the other observers say it.
+
+    Parameters
+    ----------
+    use : (n, sensors) of a track
+    z : (n, rows) of :data:`terrain.estimation.feed.ROWS`
+    age_s : (n,) time since the speed over ground was measured
+    """
+    has_reference = bool(model.references)
+    cases = (
+        (ObserverStatus.STARTING, has_reference & (age_s == np.inf)),
+        (ObserverStatus.BAD_INPUT, ~np.isfinite(z[:, :3]).any(axis=1)),
+        (ObserverStatus.RESET, (use == REOPENED).any(axis=1)),
+        (ObserverStatus.REJECTED, (use == GATED).any(axis=1)),
+        (ObserverStatus.STANDING, np.isfinite(z[:, REST_TWIST])),
+        (ObserverStatus.PREDICTED, has_reference & (age_s > STALE_AFTER_S)),
+    )
+    codes, conditions = zip(*cases, strict=True)
+    return np.select(conditions, list(map(int, codes)), int(ObserverStatus.OK))

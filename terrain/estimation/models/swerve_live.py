@@ -14,8 +14,8 @@ from terrain.estimation import feed
 from terrain.estimation.clocks import Due, SampleQueue, check_channels
 from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, Filter, FilterSettings
 from terrain.estimation.health import FeedEvidence, HealthMonitor, sensors_of
-from terrain.estimation.models.observer import Observer, ObserverOutput, ObserverStatus, status_of_use
-from terrain.estimation.models.swerve import make_filter, scheduled
+from terrain.estimation.models.observer import Observer, ObserverOutput
+from terrain.estimation.models.swerve import make_filter, scheduled, statuses
 from terrain.estimation.wheel_slip import STALE_AFTER_S, WheelSlip
 from terrain.extension import RegionMonitor, check_corrected
 from terrain.records import Array
@@ -162,20 +162,8 @@ class SwerveObserver(Observer):
                 self.reason = "no speed over ground has come yet"
         if self._region.compares:
             self._region.step(time_s, float(source.speeds_mps.mean()), float(mean[self._turn]))
-        return ObserverOutput(mean, std, slip[0], slip_std[0], self._status(speeds, age_s))
-
-    def _status(self, speeds_mps: Array, age_s: float) -> ObserverStatus:
-        """Return what the estimates are worth at a tick, in the order in which the other observers say it."""
-        found, has_reference = status_of_use(self._filter.use), bool(self._filter.model.references)
-        if has_reference and age_s == math.inf:
-            return ObserverStatus.STARTING
-        if not np.isfinite(speeds_mps).any():
-            return ObserverStatus.BAD_INPUT
-        if found is ObserverStatus.OK and math.isfinite(self._feed.numbers[0, feed.REST_TWIST]):
-            return ObserverStatus.STANDING
-        if found is ObserverStatus.OK and has_reference and age_s > STALE_AFTER_S:
-            return ObserverStatus.PREDICTED
-        return found
+        status = statuses(filter_.model, filter_.use[None], numbers, np.array([age_s]))
+        return ObserverOutput(mean, std, slip[0], slip_std[0], int(status[0]))
 
     @property
     def dropped(self) -> dict[str, int]:

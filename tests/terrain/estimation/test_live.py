@@ -19,7 +19,7 @@ from terrain.estimation.live import CHANNELS, REWIND_S, make_live_filter
 from terrain.estimation.models.choice import OBSERVERS, make_observer
 from terrain.estimation.models.observer import ObserverStatus, observe, rows_of
 from terrain.estimation.models.slip_model import SlipModel
-from terrain.estimation.models.swerve import make_filter, scheduled
+from terrain.estimation.models.swerve import make_filter, scheduled, statuses
 from terrain.estimation.wheel_slip import wheel_slip
 from terrain.extension import OUTSIDE_S
 from terrain.kinematics.logged_wheels import with_wheel_speeds
@@ -111,6 +111,7 @@ def batch(run, robot=ROBOT, name="vio15", yaw=None):
     known = [row for row in table.rows if row not in GNSS_ROWS or yaw is not None]
     desired |= dict(zip(known, table.columns(known).T, strict=True))
     desired |= {"mean": track.mean, "reference_age_s": track.reference_age_s}
+    desired |= {"status": statuses(model, track.use, table.z, track.reference_age_s)}
     desired |= {"std": np.column_stack([track.std(state) for state in track.states])}
     return track.time_s, desired, {**table.dropped, **track.dropped}
 
@@ -545,8 +546,8 @@ def turned(at_s, by_rad):
         ("odometry", gap(-1.0, 0.0), ObserverStatus.OK, 6.0, 8.0),
         ("odometry", gap(8.0, 2.0), ObserverStatus.PREDICTED, 8.2, 9.9),
         ("wheels", put(8.0, np.nan, 50), ObserverStatus.BAD_INPUT, 8.0, 8.9),
-        ("imu", turned(8.0, 0.5), ObserverStatus.REJECTED, 8.13, 8.25),
-        ("imu", turned(8.0, 0.5), ObserverStatus.RESET, 8.25, 8.4),
+        ("imu", turned(8.0, 0.5), ObserverStatus.REJECTED, 8.38, 8.5),
+        ("imu", turned(8.0, 0.5), ObserverStatus.RESET, 8.5, 8.7),
     ],
 )
 def test_a_swerve_robot_says_what_its_estimates_are_worth(stream, edit, status, from_s, to_s):
