@@ -37,7 +37,7 @@ from terrain.estimation.wheel_slip import SlipFigures, slip_figures, wheel_slip
 from terrain.extension import Correction, check_corrected, correct
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.schema import ESTIMATOR_CHANNELS
-from terrain.records import GATED, USED, Array, RunLog, SlipTrack, StateTrack, Stream
+from terrain.records import USED, Array, RunLog, SlipTrack, StateTrack, Stream
 from terrain.robots import Robot
 
 if TYPE_CHECKING:
@@ -385,6 +385,7 @@ def summarize(estimate: Estimate) -> EstimateSummary:
     own, place = estimate.path()  # odometry begins at the true pose
     error_m = (np.full(len(own), np.nan) if place is None else np.abs(own - place))[started]
     parts = track.mean, track.cov, slip.mean, slip.std
+    n_gated = sum(n for kind, n in estimate.dropped.items() if kind.endswith(" gated"))
     return EstimateSummary(
         run_id=estimate.run.run_id,
         filter=estimate.name,
@@ -406,8 +407,8 @@ def summarize(estimate: Estimate) -> EstimateSummary:
             ObserverStatus(code).label: float(steps_s[status == code].sum())
             for code in np.unique(status).tolist()
         },
-        n_dropped=sum(n for kind, n in estimate.dropped.items() if not kind.endswith(" gated")),
-        n_gated=int((track.use == GATED).sum()) if track.sensors else None,
+        n_dropped=sum(estimate.dropped.values()) - n_gated,
+        n_gated=n_gated,
         dropped=dict(estimate.dropped),
         missing=estimate.missing,
         reason=estimate.reason,

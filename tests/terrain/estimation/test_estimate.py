@@ -71,7 +71,8 @@ def test_any_filter_gives_the_same_record_and_figures_of_the_same_definition(rob
         assert row.slip_mean == pytest.approx(row.slip_true_mean, abs=0.03)
         assert row.steady_s > 5.0
     assert row.position_rmse_m < 0.5
-    assert (row.n_gated is None) == np.isnan(row.nees) == (found.innovations == {})
+    assert np.isnan(row.nees) == (found.innovations == {})
+    assert row.n_dropped + row.n_gated == sum(row.dropped.values())
     written = enriched(found).streams["state"].channels
     assert {"stale_ratio", "observer_code", *(f"std_{name}" for name in found.slip.channels)} <= set(written)
 
