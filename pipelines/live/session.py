@@ -29,7 +29,6 @@ from terrain.control.slip_table import SlipTable
 from terrain.discrepancy.watch import FALSE_ALARM_H, Watch, Watched
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.clocks import Inbox, SessionClock, numbers
-from terrain.estimation.health import LOST_AFTER_S
 from terrain.records import Sample
 from terrain.robots import Robot
 
@@ -363,16 +362,15 @@ class RobotSession:
             for name, channel in (("wheel_speed_mps", "speed_{}_mps"), ("current_a", "current_{}_a")):
                 known[name] = self.inbox.last("wheels", [channel.format(wheel) for wheel in self._wheels])
         reason = seen.reason if seen is not None else NO_SAMPLE if self.chain.is_estimated else NOT_ESTIMATED
-        if (
-            seen is not None and time_s - seen.time_s > LOST_AFTER_S
-        ):  # estimates are those of the wheels' samples
+        sensors = self.chain.health or self.inbox.health(time_s)
+        if math.isnan(time_s):
+            sensors = dict.fromkeys(sensors, "lost")
+        wheels = {health for name, health in sensors.items() if name.startswith("wheel")}
+        if seen is not None and wheels == {"lost"}:  # the last estimate is of their last sample
             known |= {name: np.full(len(self._wheels), math.nan) for name in SEEN[:3]}
             reason = NO_WHEELS
         if reason and isinstance(self.chain, LivePilot) and self.chain.control.not_followed:
             reason = NOT_FOLLOWED
-        sensors = self.chain.health or self.inbox.health(time_s)
-        if math.isnan(time_s):
-            sensors = dict.fromkeys(sensors, "lost")
         return {
             "terrain": belief.terrain or None,
             "probability": belief.probability,

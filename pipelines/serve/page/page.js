@@ -10,7 +10,7 @@
   let plots = { slip: [], current: null }, series = null;
 
   const text = (id, value) => { const node = byId(id); if (node.textContent !== value) node.textContent = value; };
-  const fixed = (value, digits, unit = "") => value === null || value === undefined ? "unknown" : value.toFixed(digits).replace(/^-(?=[0.]*$)/, "") + unit;
+  const fixed = (value, digits, unit = "") => value === null || value === undefined ? "unknown" : value.toFixed(digits).replace(/^-(?=[0.]*$)/, "").replace("-", "\u2212") + unit;
   const signed = (value, digits) => value === null || value === undefined ? "unknown" : (value < 0 ? "\u2212" : "+") + Math.abs(value).toFixed(digits);
   const degrees = (rad) => rad === null ? null : rad * 180 / Math.PI;
   const colourOf = (terrain) => {

@@ -10,7 +10,15 @@ from pipelines.live.chain import CommandStatus
 from pipelines.live.classifying import Classifier
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
-from pipelines.live.session import NO_SAMPLE, NOT_FOLLOWED, TWIST_FRESH_S, Hello, RobotSession, Served
+from pipelines.live.session import (
+    NO_SAMPLE,
+    NO_WHEELS,
+    NOT_FOLLOWED,
+    TWIST_FRESH_S,
+    Hello,
+    RobotSession,
+    Served,
+)
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live import CHANNELS
@@ -167,6 +175,24 @@ def test_wheels_that_do_not_do_what_is_commanded_are_the_reason_of_an_unknown_sl
         session.put(rows, [0.1, 0.0, 0.0], NOW_S + time_s)
         step = session.step(NOW_S + time_s)
     assert (step.observation["slip_unknown"] == NOT_FOLLOWED) == follows
+
+
+def test_over_a_link_that_is_late_slip_is_known_and_of_a_stream_that_stops_it_is_not():
+    streams = {"wheels": ["speed_left_mps", "speed_right_mps"], "gnss": ["velocity_x_mps", "velocity_y_mps"]}
+    request = Hello(session="h", robot="husky", streams=streams, control=True, follows=False)
+    session = RobotSession(request, Served(1, None, "", TABLE), load_robot("husky"))
+    for time_s in np.arange(0.0, 8.0, 0.02).tolist():
+        if time_s < 7.0:
+            rows = {"wheels": ([time_s], [[0.6, 0.6 + 0.01 * math.sin(50.0 * time_s)]])}
+            rows |= {"gnss": ([time_s], [[0.5, 0.002 * math.cos(time_s)]])}
+            session.put(rows, None, NOW_S + time_s + (0.2 if time_s > 5.0 else 0.0))
+        seen = session.step(NOW_S + time_s + (0.2 if time_s > 5.0 else 0.0)).observation
+        if 3.0 < time_s < 6.5:
+            assert seen["slip_ratio"] == pytest.approx([0.167, 0.167], abs=0.05)
+    assert (seen["slip_unknown"], list(seen["slip_ratio"])) == (
+        NO_WHEELS,
+        pytest.approx([math.nan] * 2, nan_ok=True),
+    )
 
 
 def test_before_the_first_sample_a_driven_robot_is_not_said_to_have_no_filter():
