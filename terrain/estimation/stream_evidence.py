@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.estimation.feed import FIRST_WHEEL, LIVELY, LONGER, MOVING_MPS, REPEATED, SIGNALS
+from terrain.estimation.feed import FIRST_WHEEL, LIVELY, LONGER, MOVING_MPS, REPEATED, REST_SEEN_MPS, SIGNALS
 from terrain.estimation.health import (
     AT_REST_MPS,
     COMPARED_S,
@@ -45,7 +45,9 @@ SPEED_JUMP_MPS, POSITION_JUMP_M = 0.15, 0.5  #: Least jump beyond what accelerom
 JUMPS, JUMP_STD, SCATTER_MPS, N_SCATTER = 5.0, 4.5, 0.12, 25.0
 #: Steps for which the accelerometer's integral is remembered: samples come late by a quarter of a second.
 N_GAINED = 32
-REST_SCATTER_MPS = 0.04  #: The median change of a speed of a robot that stands.
+#: The median change of a speed of a robot that stands, and after which time it does; a speed that is no more than the
+#: last is none.
+REST_SCATTER_MPS, RESTS_S, NONE_MPS = 0.04, 0.5, 2.0 * REST_SEEN_MPS
 SIGNED_MPS = 0.1  #: A robot that is slower may drive in either direction.
 #: Gyro against wheels: memories of what they are apart by, and of the wheels' turn, which the body follows later; of
 #: what is usual.  Further apart than the last number, than so many times its median, and than a part of the turn is a
@@ -171,7 +173,7 @@ class StreamEvidence:
             for places in [list(channels[one.stream])]
         ]
         self._n_rates, self._all_wheels = len(robot.rate_channels), _Run(REPEATED_S)
-        self._travelled_m, self._ahead, self._sideways = 0.0, 1.0, robot.sideways
+        self._travelled_m, self._ahead, self._sideways, self._rested_s = 0.0, 1.0, robot.sideways, 0.0
         delays = {"gnss": "gnss_delay_s", **dict.fromkeys(("odometry", "lidar"), "pose_delay_s")}
         self._delays = {stream: states.index(name) for stream, name in delays.items() if name in states}
         self._delay_s = dict.fromkeys(self._delays, 0.0)
@@ -193,6 +195,7 @@ class StreamEvidence:
             fastest_mps = float(np.nan_to_num(np.abs(motion.wheel_speed_mps)).max())
             is_fast = abs(motion.speed_x_mps) > AT_REST_MPS
             moves = fastest_mps > MOVING_MPS or is_fast
+            self._rested_s = 0.0 if moves else self._rested_s + dt_s
             self._travelled_m += fastest_mps * dt_s
             self._remember_gain(now_s, dt_s, motion)
             self._compare_turns(dt_s, readings, motion)
@@ -292,7 +295,7 @@ class StreamEvidence:
                 change = np.array([min(known, key=abs) if known else change[-1]])
                 if not known:  # what a robot can do
                     limit += SIGNALS["camera_speed_x_mps"].jump_per_s * passed_s
-                limit = max(limit, JUMPS * (seen.scatter if moves else REST_SCATTER_MPS))
+                limit = max(limit, JUMPS * (REST_SCATTER_MPS if self._rested_s > RESTS_S else seen.scatter))
                 gap = min(max(by_accel, -limit), limit) if math.isfinite(by_accel) else 0.0
                 seen.apart = seen.apart * math.exp(-passed_s / COMPARED_S) + gap
                 if moves:  # at rest nothing shakes
@@ -302,6 +305,8 @@ class StreamEvidence:
                 change = change[:2]
                 limit += float(by[0]) + JUMP_STD * math.hypot(*np.nan_to_num([*before[2:], *row[2:]]))
             _sum_jumps(seen, stamp_s, change, limit)
+            if is_speed and self._rested_s > RESTS_S and abs(row[-1]) <= NONE_MPS:  # as it should be at rest
+                seen.jumped = np.zeros(1)
         if passed_s > 0.0:
             seen.period_s += (min(passed_s, 1.0) - seen.period_s) * (0.1 if seen.period_s else 1.0)
         seen.value, seen.came_s, seen.shown = row, now_s, shown

@@ -155,6 +155,14 @@ def test_a_speed_that_jumps_is_named_whatever_there_is_to_compare_it_with(stream
     assert (found[round((FAULT_S + 0.3) / DT_S) :] == Health.STEPPED).all()
 
 
+def test_a_robot_that_stands_has_the_speed_that_jumps_less_than_one_that_drives_and_none_is_right_again():
+    rest = {"speed_x_mps": 0.0, "wheel_speed_mps": np.zeros(2)}
+    for amount, last in ((0.3, Health.STEPPED), (-SPEED_MPS, Health.FRESH)):
+        found = judged(added("odometry", "speed_x_mps", amount), **rest)["camera_speed"]
+        assert (found[: round(FAULT_S / DT_S)] == Health.FRESH).all()
+        assert found[-1] == last
+
+
 def coarse(alone):
     """Rates of wheels that turn evenly and are rounded, from the fault on; or of the left one only."""
 
