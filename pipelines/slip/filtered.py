@@ -279,9 +279,7 @@ def motion_figure(estimate: Estimate) -> Figure:
             Line(sensor, track.time_s, values, i)
             for i, (sensor, values) in enumerate(measured.get(state, {}).items(), start=1)
         ]
-        true = estimate.true(state)
-        if estimate.truth is not None:
-            true = estimate.truth[:, track.states.index(state)]
+        true = estimate.true_state(state)
         marks += estimated(name, track.time_s, track.state(state), track.std(state), true)
         panels.append(Panel(marks, label))
     innovations = estimate.innovations

@@ -50,11 +50,9 @@ TUNINGS = ("physical", "thesis", "likelihood")
 #: Tuning unless another is chosen: vio12 is the thesis' own filter, all others are physical.
 OWN_TUNING: Mapping[str, str] = {"vio12": "thesis"}
 THESIS_EMA_ALPHA = 0.2  #: Thesis (7.8): smoothing of the camera.
-#: States whose error is judged (NEES): those that slip is computed from.
 SPEEDS = ("speed_x_mps", "speed_y_mps")
+#: States whose error is judged (NEES): those that slip is computed from.
 JUDGED_STATES = (*SPEEDS, "yaw_rate_radps", "slip_speed_")
-
-
 #: Statuses in which slip is judged; a part that is not excited may be the cornering stiffness alone.
 SETTLED = (ObserverStatus.OK, ObserverStatus.UNEXCITED)
 #: Statuses in which the speed over ground was not measured lately.
@@ -123,6 +121,10 @@ class Estimate:
         if channel == "yaw_rad":
             return np.asarray(wrapped(np.interp(self.track.time_s, truth.time_s, np.unwrap(values))))
         return np.interp(self.track.time_s, truth.time_s, values)
+
+    def true_state(self, name: str) -> Array | None:
+        """Return the truth (n,) of a state, behind the encoders' low-pass where ``truth`` is known; or None."""
+        return self.true(name) if self.truth is None else self.truth[:, self.track.states.index(name)]
 
     def path(self) -> tuple[Array, Array | None]:
         """Return the estimated and the true position (n,), x + i y; NaN and None where they are not known.
@@ -341,10 +343,8 @@ class EstimateSummary:
     position_rmse_m: float  #: error of the position over the run, and at its end
     position_end_m: float
     status_s: Mapping[str, float]  #: how long it had each status
-    n_dropped: (
-        int  #: samples left out, measurements rejected by a gate (None where it has none), and counts by kind
-    )
-    n_gated: int | None
+    n_dropped: int  #: samples left out, measurements rejected by a gate, and counts by kind
+    n_gated: int
     dropped: Mapping[str, int]
     missing: tuple[str, ...]  #: what it takes and the run never has
     reason: str  #: why slip is not known in all of it, in a sentence; empty where it is
@@ -361,8 +361,10 @@ def summarize(estimate: Estimate) -> EstimateSummary:
     if truth is not None:
         judged = [state for state in track.states if state.startswith(JUDGED_STATES)]
         mean_nees = known_mean(nees(track, truth, judged)) / len(judged)
-        speeds = np.isin(track.states, SPEEDS)
-        speed_rmse_mps = math.sqrt(known_mean((track.mean - truth)[:, speeds] ** 2) * speeds.sum())
+    of_speeds = [(track.state(name), estimate.true_state(name)) for name in SPEEDS if name in track.states]
+    errors = [speed - true for speed, true in of_speeds if true is not None]
+    if errors:
+        speed_rmse_mps = math.sqrt(known_mean(np.column_stack(errors) ** 2) * len(errors))
     slips = {}
     for k, name in enumerate(slip.channels):
         mean, std, true = slip.mean[settled, k], slip.std[settled, k], estimate.true(name)
