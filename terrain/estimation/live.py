@@ -35,9 +35,9 @@ from terrain.estimation import feed
 from terrain.estimation.clocks import NEVER, REWIND_S, readable
 from terrain.estimation.filter import Filter
 from terrain.estimation.models.choice import OBSERVERS, make_observer, suitable_filter
-from terrain.estimation.models.observer import Observer, ObserverFeed, ObserverStatus
+from terrain.estimation.models.observer import Feed, Observer, ObserverFeed, ObserverStatus
 from terrain.estimation.models.swerve import make_filter
-from terrain.estimation.models.swerve_live import SETTINGS, SwerveFeed, swerve_live
+from terrain.estimation.models.swerve_live import SETTINGS, swerve_live
 from terrain.estimation.wheel_slip import STALE_AFTER_S
 from terrain.extension import Correction
 from terrain.logs.schema import WHEELS_CHANNELS
@@ -115,7 +115,7 @@ class Live:
     def __init__(
         self,
         model: Observer,
-        source: ObserverFeed | SwerveFeed,
+        source: Feed,
         robot: Robot,
         channels: Mapping[str, tuple[str, ...]],
         correction: Correction | None = None,
@@ -219,10 +219,7 @@ class Live:
     @property
     def dropped(self) -> dict[str, int]:
         """What was not taken so far, as counts by stream and kind, and by what a filter did not believe."""
-        counts = self._counted + self._feed.dropped + Counter(self.model.dropped)
-        for name, queue in self._queues.items():
-            counts.update({f"{name}: {kind}": n for kind, n in queue.counts.items()})
-        return dict(+counts)
+        return dict(self._counted + Counter(self._feed.counts) + Counter(self.model.dropped))
 
     @property
     def _last_s(self) -> float:
@@ -358,8 +355,8 @@ class Live:
         while self._last_s >= late_s - feed.TICK_S:
             done.append(self._ticks.pop()[0])
         memory, taken_s = self._ticks[-1][1]
-        for one, snapshot in zip((self._feed, self.model), memory, strict=True):
-            one.restore(snapshot)
+        self._feed.restore(memory[0])
+        self.model.restore(memory[1])
         for (name, queue), before_s in zip(self._queues.items(), taken_s, strict=True):
             queue.taken_s = before_s
             queue.waiting.clear()
@@ -420,7 +417,7 @@ def make_live_filter(
     (array([0.4, 0.4, 0.4]), True)
     """
     model: Observer
-    source: ObserverFeed | SwerveFeed
+    source: Feed
     if name in OBSERVERS:
         model = make_observer(name, robot)
         terms = () if correction is None else correction.axle_terms

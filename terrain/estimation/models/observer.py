@@ -26,7 +26,7 @@ import numpy as np
 
 from terrain.errors import DataError
 from terrain.estimation.clocks import CLOCK_SET_S, Due, SampleQueue, check_channels
-from terrain.estimation.feed import TICK_S, places_among
+from terrain.estimation.feed import FIX_STD_M, FLOAT_STD_M, TICK_S, places_among
 from terrain.estimation.filter import Filter, FilterModel, FilterSettings
 from terrain.extension import rolling_axle
 from terrain.learned_term import Factor, LearnedTerm
@@ -70,9 +70,6 @@ INACCURATE_M = 0.2
 
 CLOCK_SET_SAMPLES = 10
 """So many samples in a row, a second behind the newest, are of a clock that was set back."""
-
-FIX_STD_M, FLOAT_STD_M = 0.02, 0.5
-"""Of a position whose standard deviation is not given: with a fix (RTK), and without one, or where neither is known."""
 
 CHANNELS: Mapping[str, tuple[str, ...]] = {
     "imu": ("gyro_z_radps", "roll_rad", "pitch_rad", "accel_y_mps2", "accel_x_mps2"),
@@ -261,15 +258,14 @@ class FilterObserver(Observer):
         return mean, np.sqrt(np.maximum(variance, 0.0))
 
 
-class ObserverFeed(_WithMemory):
-    """Rows of an observer from the samples of a robot as they come.
+class Feed(ABC, _WithMemory):
+    """Rows of a filter or an observer from the samples of a robot as they come.
 
     Parameters
     ----------
-    robot : tracked or car-like
-    rows : those of :data:`ROWS` that the observer takes
-    channels : names of the columns of each stream; ``ConfigError`` if the wheels have no speed that the observer takes
-    terms : learned motion of a car-like robot (:attr:`terrain.extension.Correction.axle_terms`)
+    robot : whose they are
+    channels : names of the columns of each stream; ``ConfigError`` if the wheels have no speed of the robot's
+    read : channels that are read of each stream beside the wheels, those that it lacks as NaN
 
     Attributes
     ----------
@@ -277,11 +273,59 @@ class ObserverFeed(_WithMemory):
     last_s : stamp of the last tick; minus infinity before the first
     speeds_mps, motor_radps : of the logged wheels at the last tick
     period_s : of ticks that go on where the wheels give nothing; 0 for none
-    dropped : what was left out, as counts by stream and kind: wheels not later than the sample before, late or
-        inaccurate fixes, and clocks that were set back
     """
 
     period_s = 0.0
+
+    def __init__(
+        self, robot: Robot, channels: Mapping[str, tuple[str, ...]], read: Mapping[str, Sequence[str]]
+    ) -> None:
+        wheels = channels.get("wheels", ())
+        check_channels("wheels", robot.rate_channels, wheels)
+        self._robot, self.last_s = robot, -math.inf
+        self._rate_columns = places_among(robot.rate_channels, wheels)
+        self.speeds_mps = self.motor_radps = np.full(len(robot.rate_channels), math.nan)
+        self.queues = {
+            stream: SampleQueue(places_among(names, channels[stream]))
+            for stream, names in read.items()
+            if channels.get(stream)
+        }
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What was left out, as counts by stream and kind."""
+        queued = {
+            f"{name}: {kind}": n for name, queue in self.queues.items() for kind, n in queue.counts.items()
+        }
+        return dict(+(Counter(queued) + self.dropped))
+
+    @property
+    @abstractmethod
+    def dropped(self) -> Counter[str]:
+        """What was left out of what the queues gave, and of the wheels."""
+
+    @abstractmethod
+    def begin(self) -> None:
+        """Begin anew after a clock was set back."""
+
+    @abstractmethod
+    def follows(self, time_s: float) -> int:
+        """Return what a stamp of the wheels is: 1 taken, -1 of a clock that was set back, 0 not taken, and counted."""
+
+    @abstractmethod
+    def tick(self, time_s: float, wheels: Array | None, due: Mapping[str, Due]) -> Array:
+        """Return the row (m,) of a tick, of the samples that came since the last; None of wheels that gave nothing."""
+
+
+class ObserverFeed(Feed):
+    """Rows of an observer: means of the samples since the tick before, and fixes with their age.
+
+    Parameters
+    ----------
+    robot, channels : of :class:`Feed`
+    rows : those that the observer takes
+    terms : learned motion of a car-like robot (:attr:`terrain.extension.Correction.axle_terms`)
+    """
 
     def __init__(
         self,
@@ -290,13 +334,7 @@ class ObserverFeed(_WithMemory):
         channels: Mapping[str, tuple[str, ...]],
         terms: Sequence[LearnedTerm] = (),
     ) -> None:
-        self._robot, self._terms, wheels = robot, tuple(terms), channels.get("wheels", ())
-        check_channels("wheels", robot.rate_channels, wheels)
-        names = map("speed_{}_mps".format, robot.logged_wheels)
-        self._speeds = {
-            name: wheels.index(rate) for name, rate in zip(names, robot.rate_channels, strict=True)
-        }
-        self.speeds_mps = self.motor_radps = np.full(len(self._speeds), math.nan)
+        self._terms, self._speeds = tuple(terms), list(map("speed_{}_mps".format, robot.logged_wheels))
         self.mps_per_rate = robot.wheel_radius_m / robot.reduction_ratio if robot.by_motor else 1.0
         self._rows, self._takes_place = rows, "position_x_m" in rows
         self._fixes: dict[str, str] = {}
@@ -311,13 +349,16 @@ class ObserverFeed(_WithMemory):
         self._channels = {"steering": robot.steer_channels, **CHANNELS}
         read = {"steering", "imu", *self._fixes.values()}
         read |= {"pose", "gnss", "compass"} if self._takes_place else set()
-        self.queues = {
-            stream: SampleQueue(places_among(names, channels[stream]))
-            for stream, names in self._channels.items()
-            if channels.get(stream) and stream in read
-        }
-        self.dropped: Counter[str] = Counter()
+        super().__init__(
+            robot, channels, {name: self._channels[name] for name in self._channels if name in read}
+        )
+        self._dropped: Counter[str] = Counter()
         self.begin()
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Wheels not later than the sample before, late or inaccurate fixes, and clocks that were set back."""
+        return self._dropped
 
     def begin(self) -> None:
         """Begin anew: nothing was measured before."""
@@ -329,14 +370,14 @@ class ObserverFeed(_WithMemory):
         self._heading, self._n_behind = (-math.inf, math.nan), 0
 
     def follows(self, time_s: float) -> int:
-        """Return what a stamp of the wheels is: 1 taken, -1 of a clock that was set back, 0 not taken, and counted."""
+        """Return what a stamp of the wheels is, as :class:`Feed`."""
         before_s = self.last_s
         if before_s < time_s < math.inf:
             self._n_behind = 0
             return 1
         self._n_behind = self._n_behind + 1 if time_s <= before_s - CLOCK_SET_S else 0
         is_set = self._n_behind >= CLOCK_SET_SAMPLES
-        self.dropped["time: clock set" if is_set else "wheels: stamp does not increase"] += 1
+        self._dropped["time: clock set" if is_set else "wheels: stamp does not increase"] += 1
         return -1 if is_set else 0
 
     def tick(self, time_s: float, wheels: Array | None, due: Mapping[str, Due]) -> Array:
@@ -345,13 +386,14 @@ class ObserverFeed(_WithMemory):
         step_s, self.last_s = time_s - self.last_s, time_s
         for name, samples in due.items():
             if not samples and self.queues[name].n_behind >= CLOCK_SET_SAMPLES:  # its own clock was set back
-                self.dropped["time: clock set"] += 1
+                self._dropped["time: clock set"] += 1
                 self.queues[name].taken_s, self.queues[name].n_behind = -math.inf, 0
         row = dict.fromkeys(self._rows, math.nan)
-        speeds = {name: float(wheels[column]) * self.mps_per_rate for name, column in self._speeds.items()}
-        self.speeds_mps = np.array(list(speeds.values()))
+        rates = wheels[self._rate_columns]
+        self.speeds_mps = rates * self.mps_per_rate
+        speeds = dict(zip(self._speeds, self.speeds_mps.tolist(), strict=True))
         if self._robot.by_motor:
-            self.motor_radps = wheels[list(self._speeds.values())]
+            self.motor_radps = rates
         row |= speeds | dict(zip(INERTIAL_ROWS, self._means("imu", time_s, due), strict=True))
         row |= zip(self._robot.steer_rows, self._means("steering", time_s, due, last=True), strict=True)
         if self._terms and isinstance(self._robot, BicycleRobot):
@@ -387,7 +429,7 @@ class ObserverFeed(_WithMemory):
         for stamp_s, _, values in reversed(due.get(stream, ())):
             sample = values.tolist()
             if time_s - stamp_s > LATE_S:
-                self.dropped[f"{stream}: late"] += 1
+                self._dropped[f"{stream}: late"] += 1
             elif not all(map(math.isnan, sample[:2])) or (sensor == "gnss" and not math.isnan(sample[3])):
                 if sensor == "gnss" and not sample[2] > 0.0:
                     sample[2] = FIX_STD_M if sample[5] >= 0.5 else FLOAT_STD_M
@@ -403,9 +445,9 @@ class ObserverFeed(_WithMemory):
             if any(math.isnan(value) for value in (sample[:2] if stream == "gnss" else sample)):
                 continue
             if time_s - stamp_s > LATE_S:
-                self.dropped[f"{stream}: late"] += 1
+                self._dropped[f"{stream}: late"] += 1
             elif stream == "gnss" and sample[2] > INACCURATE_M:
-                self.dropped["gnss: inaccurate"] += 1
+                self._dropped["gnss: inaccurate"] += 1
             else:
                 last = (stamp_s, sample)
         return last
@@ -460,8 +502,7 @@ def rows_of(
             due = {name: queue.take(time_s) for name, queue in feed.queues.items()}
             times.append(time_s)
             found.append(feed.tick(time_s, wheels.values[k], due))
-    counts = {f"{name}: {kind}": n for name, queue in feed.queues.items() for kind, n in queue.counts.items()}
-    return np.array(times), np.array(found).reshape(len(found), len(rows)), counts | feed.dropped
+    return np.array(times), np.array(found).reshape(len(found), len(rows)), feed.counts
 
 
 class ObserverTrack(NamedTuple):

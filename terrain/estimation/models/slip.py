@@ -58,6 +58,7 @@ import numpy as np
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
+from terrain.estimation.feed import FLOAT_STD_M
 from terrain.estimation.filter import (
     GATE_PROBABILITY,
     LARGEST,
@@ -67,7 +68,7 @@ from terrain.estimation.filter import (
     FilterSettings,
     differentiate,
 )
-from terrain.estimation.models.observer import FLOAT_STD_M, FilterObserver, ObserverOutput, ObserverStatus
+from terrain.estimation.models.observer import FilterObserver, ObserverOutput, ObserverStatus
 from terrain.estimation.stuck import Turns, next_turns
 from terrain.estimation.wheel_slip import wheel_speed_scatter_mps
 from terrain.kernels import njit

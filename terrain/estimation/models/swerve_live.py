@@ -11,10 +11,10 @@ import numpy as np
 
 from terrain.errors import ConfigError
 from terrain.estimation import feed
-from terrain.estimation.clocks import Due, SampleQueue, check_channels
+from terrain.estimation.clocks import Due
 from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, Filter, FilterSettings
 from terrain.estimation.health import FeedEvidence, HealthMonitor, sensors_of
-from terrain.estimation.models.observer import Observer, ObserverOutput
+from terrain.estimation.models.observer import Feed, Observer, ObserverOutput
 from terrain.estimation.models.swerve import make_filter, scheduled, statuses
 from terrain.estimation.wheel_slip import STALE_AFTER_S, WheelSlip
 from terrain.extension import RegionMonitor, check_corrected
@@ -30,10 +30,8 @@ _NOTHING = {
 }
 
 
-class SwerveFeed:
+class SwerveFeed(Feed):
     """Rows of a swerve robot's filter from samples as they come, by the loop of whole logs over one tick.
-
-    Attributes are those of :class:`~terrain.estimation.models.observer.ObserverFeed`.
 
     Parameters
     ----------
@@ -48,7 +46,10 @@ class SwerveFeed:
         channels: Mapping[str, tuple[str, ...]],
         initial_yaw_rad: float | None,
     ) -> None:
-        self._robot, self._filter, self.last_s = robot, filter, -math.inf
+        has = {"gnss": initial_yaw_rad is not None, "odometry": robot.describes("camera")}
+        read = {name: names for name, names in feed.STREAMS.items() if has.get(name, True)}
+        super().__init__(robot, channels, read)
+        self._filter = filter
         sensors, camera = robot.completed.sensors, robot.completed.camera
         rates = {
             "wheels": sensors.wheels_rate_hz,
@@ -62,16 +63,7 @@ class SwerveFeed:
             robot, period_s, initial_yaw_rad or 0.0, is_causal=True, is_live=True
         )
         self.memory, self.numbers = feed.new_feed(), np.full((1, feed.N_NUMBERS), np.nan)
-        check_channels("wheels", robot.rate_channels, channels.get("wheels", ()))
-        self._rate_columns = feed.places_among(robot.rate_channels, channels["wheels"])
-        has = {"gnss": initial_yaw_rad is not None, "odometry": robot.describes("camera")}
-        self.queues = {
-            name: SampleQueue(feed.places_among(feed.STREAMS[name], channels[name]))
-            for name in feed.STREAMS
-            if channels.get(name) and has.get(name, True)
-        }
         self.wheels = np.full(len(channels["wheels"]), math.nan)
-        self.motor_radps = self.speeds_mps = np.full(len(robot.wheels), math.nan)
 
     @property
     def dropped(self) -> Counter[str]:
@@ -86,7 +78,7 @@ class SwerveFeed:
         feed.forget_times(self.memory)
 
     def follows(self, time_s: float) -> int:
-        """Return what a stamp of the wheels is: 1 taken, -1 of a clock that was set back, 0 not taken, and counted."""
+        """Return what a stamp of the wheels is, as :class:`~.observer.Feed`."""
         follows = self._filter.follows(time_s)
         if follows == 0:  # to count it, and remember a jump
             self._filter.step(time_s, np.full(len(self._filter.model.rows), np.nan))
