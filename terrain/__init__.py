@@ -21,6 +21,7 @@ FACE = {
     "load_robot": "terrain.robots.load_robot",
     "simulate": "terrain.simulation.run.simulate_run",
     "estimate": "pipelines.slip.estimate.estimate_runs",
+    "estimate_run": "terrain.estimation.estimate.estimate_run",
     "learn_slip": "pipelines.slip.learn_slip.learn_slip_table",
     "cut_windows": "features.windows.windows_of",
     "TerrainClassifier": "pipelines.learn.classifier.TerrainClassifier",

@@ -70,6 +70,25 @@ def test_runs_are_written_with_their_tracks_and_pictures(tmp_path):
     np.testing.assert_array_equal(same.streams["slip"].values, found.streams["slip"].values)
 
 
+def test_json_and_report_have_one_shape_whichever_filter_made_them():
+    tracked = simulate_run(load_robot("orchard_ugv"), "tilled_loam", "straight", 0, duration_s=10.0)
+    results = [
+        estimate_runs(runs, filter=name).result
+        for runs, name in (
+            ([drive(duration_s=8.0)], "vio15"),
+            ([tracked], "tracked"),
+            ([tracked], "gyrodometry"),
+        )
+    ]
+    first, *others = (each.as_json() for each in results)
+    for other in others:
+        assert set(other) == set(first)
+        assert set(other["runs"][0]) == set(first["runs"][0])
+    assert [bool(each["runs"][0]["slip"]) for each in (first, *others)] == [True, True, False]
+    assert [each["tuning"] for each in (first, *others)] == ["physical", None, None]
+    assert "slip is not known" in results[2].report.answer
+
+
 def test_process_noise_is_tuned_on_chosen_runs():
     """With a receiver or without: it serves the other as well."""
     runs = [drive(duration_s=8.0, number=1, gnss=Gnss()), drive(duration_s=8.0, number=2)]
