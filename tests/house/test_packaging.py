@@ -115,14 +115,15 @@ def test_every_number_in_the_yaml_has_a_source():
     assert [found for name, node in content.items() for found in bare_numbers(node, name)] == []
 
 
-def test_the_mapping_of_the_page_on_formats_is_accepted(tmp_path):
+def test_the_first_mapping_of_its_page_is_accepted(tmp_path):
     from terrain.logs.mapping import find_runs, load_mapping
 
-    page = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "mapping.md").read_text(encoding="utf-8")
     (tmp_path / "mapping.yaml").write_text(re.search(r"```yaml\n(.*?)```", page, flags=re.DOTALL)[1])
     (tmp_path / "ICE").mkdir()
-    (tmp_path / "ICE" / "imu 1.csv").write_text("stamp,yaw rate\n0,90\n20,180\n")
-    (tmp_path / "ICE" / "wheels 1.csv").write_text("t,vl,vr\n0,3.6,7.2\n0.02,3.6,7.2\n")
+    (tmp_path / "ICE" / "imu 1.csv").write_text("stamp,yaw rate,az\n0,90,1\n20,180,1\n")
+    wheels = "logger 7\n\nt;vl;vr\ns;km/h;km/h\n0;3,6;7,4\n0,02;3,6;7,4\n"
+    (tmp_path / "ICE" / "wheels 1.csv").write_text(wheels)
     (read,) = find_runs(tmp_path, load_mapping(tmp_path / "mapping.yaml"))
     run = read(repair=False)
     assert run.terrains == ("ICE",)
