@@ -238,12 +238,12 @@ def test_the_commanded_turn_is_kept_while_a_side_slips_more(name, twist):
 def test_a_replayed_log_winds_nothing_up(name):
     """Another controller drives: what is left of its turn is no error of these commands."""
     robot, twist = ROBOTS[name], np.array([0.4, 0.0, 0.4])
-    plant, driver = RollingRobot(robot, **SLICK), control(robot, "plain")
+    plant, other = RollingRobot(robot, **SLICK), control(robot, "plain")
     replayed = control(robot, follows=False)
     for _ in range(500):
         seen = plant.estimate()
         now = plant.time_s, DT_S, twist
-        plant.step(driver.step(*now, None, BELIEF, OutputStatus.NONE, holds=True)[0])
+        plant.step(other.step(*now, None, BELIEF, OutputStatus.NONE, holds=True)[0])
         command, _ = replayed.step(*now, seen, BELIEF, OutputStatus.NONE, holds=True)
     rolled = float(np.linalg.pinv(replayed._turning.rolling)[2] @ plant.wheel_mps)
     ratio = rolled / plant.motion[2] if robot.skids else 1.0
