@@ -89,8 +89,9 @@ class _Run:
 class _Seen:
     """What is remembered of a sensor."""
 
-    def __init__(self, sensor: Sensor, columns: list[int]) -> None:
-        self.sensor, self.columns, self.is_reference = sensor, columns, sensor.stream in _REFERENCES
+    def __init__(self, sensor: Sensor, channels: list[str]) -> None:
+        self.sensor, self.is_reference = sensor, sensor.stream in _REFERENCES
+        self.columns = [channels.index(name) for name in sensor.channels if name in channels]
         self.run = _Run(math.inf if sensor.stream == "wheels" else REPEATED_S)
         self.value, self.shown = np.empty(0), np.zeros(2)
         self.came_s, self.jumped_s, self.period_s, self.apart = math.nan, math.nan, 0.0, 0.0
@@ -167,11 +168,8 @@ class StreamEvidence:
         states: Sequence[str] = (),
     ) -> None:
         self._widths = {stream: len(names) for stream, names in channels.items()}
-        self._seen = [
-            _Seen(one, [places.index(name) for name in one.channels if name in places])
-            for one in sensors
-            for places in [list(channels[one.stream])]
-        ]
+        self._seen = [_Seen(sensor, list(channels[sensor.stream])) for sensor in sensors]
+        self._gyro = next((seen for seen in self._seen if seen.sensor.name == "gyro"), None)
         self._n_rates, self._all_wheels = len(robot.rate_channels), _Run(REPEATED_S)
         self._travelled_m, self._ahead, self._sideways, self._rested_s = 0.0, 1.0, robot.sideways, 0.0
         delays = {"gnss": "gnss_delay_s", **dict.fromkeys(("odometry", "lidar"), "pose_delay_s")}
@@ -203,23 +201,19 @@ class StreamEvidence:
                 self._delay_s[stream] = float(motion.mean[place])
             if abs(motion.speed_x_mps) > SIGNED_MPS:
                 self._ahead = math.copysign(1.0, motion.speed_x_mps)
-        wheels = readings.get("wheels")
-        if wheels is not None and wheels.values.shape[1:] == (self._widths["wheels"],):
-            for stamp_s, values in zip(wheels.time_s.tolist(), wheels.values.tolist(), strict=True):
-                self._all_wheels.take(stamp_s, [value for value in values if value == value], moves)
+        if (rows := self._values(self._seen[0], readings)) is not None:
+            for stamp_s, row in zip(readings["wheels"].time_s.tolist(), rows.tolist(), strict=True):
+                self._all_wheels.take(stamp_s, [value for value in row if value == value], moves)
         for seen in self._seen:
-            if (values := self._values(seen.sensor, readings)) is not None:
+            if (values := self._values(seen, readings)) is not None:
                 stamps = readings[seen.sensor.stream].time_s.tolist()
                 for stamp_s, row in zip(stamps, values[:, seen.columns], strict=True):
                     if stamp_s != seen.run.stamp_s and np.isfinite(row[:2]).all():
                         self._take(seen, now_s, stamp_s, row, moves)
         evidence = [self._judge(seen, now_s, moves, is_fast) for seen in self._seen]
         judged = [(one.health, seen) for one, seen in zip(evidence, self._seen, strict=True)]
-        periods_s = [
-            seen.period_s
-            for health, seen in judged
-            if seen.is_reference and health <= Health.LATE and seen.period_s
-        ]
+        sound = [seen for health, seen in judged if seen.is_reference and health <= Health.LATE]
+        periods_s = [seen.period_s for seen in sound if seen.period_s]
         gated = max(LOST_AFTER_S, LOST_PERIODS * min(periods_s, default=math.inf)) < age_s < math.inf
         apart = any(health == Health.DISAGREES and seen.sensor.name in _SPEEDS for health, seen in judged)
         for place, seen in enumerate(self._seen):
@@ -232,18 +226,16 @@ class StreamEvidence:
     def mask(self, readings: dict[str, Reading], health: Sequence[int]) -> None:
         """Replace what sensors gave that are frozen or stepped by NaN: a filter must not learn from it."""
         for seen, status in zip(self._seen, health, strict=True):
-            values = (
-                self._values(seen.sensor, readings) if status in (Health.FROZEN, Health.STEPPED) else None
-            )
+            values = self._values(seen, readings) if status in (Health.FROZEN, Health.STEPPED) else None
             if values is not None:
                 values, stream = values.copy(), seen.sensor.stream
                 values[:, seen.columns] = math.nan
                 readings[stream] = readings[stream]._replace(values=values)
 
-    def _values(self, sensor: Sensor, readings: Mapping[str, Reading]) -> Array | None:
+    def _values(self, seen: _Seen, readings: Mapping[str, Reading]) -> Array | None:
         """Return what came of a sensor's stream; None of nothing, or of another number of columns."""
-        reading = readings.get(sensor.stream)
-        fits = reading is not None and reading.values.shape[1:] == (self._widths[sensor.stream],)
+        reading = readings.get(seen.sensor.stream)
+        fits = reading is not None and reading.values.shape[1:] == (self._widths[seen.sensor.stream],)
         return reading.values if reading is not None and fits else None
 
     def _remember_gain(self, now_s: float, dt_s: float, motion: LiveEstimate) -> None:
@@ -260,13 +252,12 @@ class StreamEvidence:
 
     def _compare_turns(self, dt_s: float, readings: Mapping[str, Reading], motion: LiveEstimate) -> None:
         """Compare the gyro's last rate with the turn that the wheels of a robot that skids make."""
-        for seen in self._seen:
-            values = self._values(seen.sensor, readings) if seen.sensor.name == "gyro" else None
-            if values is not None and len(values):
-                left, right = motion.wheel_speed_mps[[0, -1]].tolist()
-                loss = 0.0 if self._turn_loss is None else float(motion.mean[self._turn_loss])
-                turn = (1.0 - loss) * (right - left) / self._track_m
-                self._turns = self._turns.after(float(values[-1, seen.columns[0]]), turn, dt_s)
+        values = None if self._gyro is None else self._values(self._gyro, readings)
+        if self._gyro is not None and values is not None and len(values):
+            left, right = motion.wheel_speed_mps[[0, -1]].tolist()
+            loss = 0.0 if self._turn_loss is None else float(motion.mean[self._turn_loss])
+            turn_radps = (1.0 - loss) * (right - left) / self._track_m
+            self._turns = self._turns.after(float(values[-1, self._gyro.columns[0]]), turn_radps, dt_s)
 
     def _take(self, seen: _Seen, now_s: float, stamp_s: float, row: Array, moves: bool) -> None:
         """Remember a sample, and by how much it differs from what the one before lets expect."""
@@ -281,8 +272,7 @@ class StreamEvidence:
             shown = np.array(
                 [np.interp(at_s, gained[0], one) if one.size else math.nan for one in gained[1:]]
             )
-        before, before_s, n_same = seen.value, run.stamp_s, run.n_same
-        passed_s = stamp_s - before_s
+        before, n_same, passed_s = seen.value, run.n_same, stamp_s - run.stamp_s
         run.take(stamp_s, row[:2].tolist(), moves)
         if run.n_same >= N_REPEATED:  # it measures nothing: what it changes by then is no jump
             seen.jumped, seen.apart = np.zeros(1), 0.0
@@ -326,8 +316,8 @@ class StreamEvidence:
             )
             is_long = run.is_long and run.n_same >= REPEATED[FIRST_WHEEL] and moves and turns
             is_long &= any(one.run.n_same <= LIVELY for one in others)
-            if any(one.value.any() and one.run.n_same >= REPEATED[FIRST_WHEEL] for one in others):
-                run.was_frozen = False  # it turns as evenly as another
+            # where it turns as evenly as another it is not
+            run.was_frozen &= not any(one.value.any() and one.run.n_same > LIVELY for one in others)
             whole.was_frozen |= whole.is_long and len(whole.value) > self._n_rates
             is_long |= whole.was_frozen and (is_fast or (moves and turns))
         else:  # a steering angle that may not stay is seen not to follow its command
