@@ -378,9 +378,10 @@ class RobotControl:
             check_channels("wheels", robot.rate_channels, wheels)
         self._n_columns = len(wheels), len(imu)
         sensors = sensors_of(robot, channels) if states else ()
-        self._monitor, self.sensors = HealthMonitor(sensors), tuple(sensor.name for sensor in sensors)
+        # a filter that estimates the angles of wheels judges by its feed; of others what never comes is not judged
+        self._monitor = HealthMonitor(sensors, Health.LOST if self._angles else Health.FRESH)
+        self.sensors = self._monitor.names
         self._of_slip = [i for i, name in enumerate(self.sensors) if name not in NOT_OF_SLIP]
-        # a filter that estimates the angles of wheels judges by its feed
         self._evidence = None
         if states and not self._angles:
             self._evidence = StreamEvidence(robot, channels, sensors, states)

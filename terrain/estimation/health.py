@@ -157,7 +157,7 @@ class Evidence(NamedTuple):
 
 
 class HealthMonitor:
-    """The sensors of a robot, and the health of each by what is known of it.
+    """The sensors of a robot, and the health of each by what is known of it; ``first`` is that before anything is.
 
     Attributes
     ----------
@@ -172,9 +172,9 @@ class HealthMonitor:
     [[0], [7], [6]]
     """
 
-    def __init__(self, sensors: Sequence[Sensor]) -> None:
+    def __init__(self, sensors: Sequence[Sensor], first: Health = Health.LOST) -> None:
         self.names = tuple(sensor.name for sensor in sensors)
-        self.health = [int(Health.LOST)] * len(sensors)
+        self.health = [int(first)] * len(sensors)
 
     @property
     def by_name(self) -> dict[str, str]:
