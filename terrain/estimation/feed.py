@@ -66,7 +66,10 @@ MAX_AGE_PERIODS = 1.5
 #: periods, so that half of one between two of them leaves nothing to how stamps are rounded, nor to whether the
 #: period is that of a description (live) or the median of a log (batch).
 GAP_PERIODS = 5.5
-#: So many time constants after such a start a low-pass has forgotten it: till then it is ahead of one that ran on, of a
+#: Over a gap of less than so many time constants, a low-pass runs on: what was measured before and after it, and a
+#: straight line between, is the recent past.
+BRIDGED_LAGS = 2.0
+#: So many time constants after a start anew a low-pass has forgotten it: till then it is ahead of one that ran on, of a
 #: yaw by the turn rate times the time constant, and gives nothing.
 SETTLED_LAGS = 5.0
 #: A value that has jumped and stays is accepted after this long: it is left to the filter's gate.
@@ -358,9 +361,10 @@ def _take(value: float, instant_s: float, came_s: float, line: Any, limit: Any) 
             return True
     line.judged, line.judged_s, line.jumping_s = value, instant_s, np.nan
     step_s, smooth = instant_s - line.instant_s, value
-    if step_s > limit.gap_s:
+    longest_s = max(limit.gap_s, BRIDGED_LAGS * limit.time_constant_s)
+    if step_s > longest_s:
         line.settled_s = instant_s + SETTLED_LAGS * limit.time_constant_s
-    elif limit.time_constant_s > 0.0 and step_s <= limit.gap_s:
+    elif limit.time_constant_s > 0.0 and step_s <= longest_s:
         smooth = low_pass_step(value, line.value, line.low_passed, step_s, limit.time_constant_s)
     line.value, line.instant_s, line.came_s, line.low_passed = value, instant_s, came_s, smooth
     line.was_given = False

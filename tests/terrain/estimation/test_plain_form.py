@@ -181,6 +181,7 @@ def plain_derived(clock, table, once, twice, imu_s, accel_z, robot):
 def plain_low_pass(time_s, value, tau_s, gap_s):
     """Return the low-passed value, and whether it has forgotten where it started after the last gap."""
     out, begun_s, settled = np.array(value), -np.inf, np.ones(value.size, bool)
+    gap_s = max(gap_s, feed.BRIDGED_LAGS * tau_s)
     for k in range(1, value.size):
         step_s = time_s[k] - time_s[k - 1]
         if step_s > gap_s:
