@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -115,8 +116,9 @@ class Estimate:
             return None
         if channel in ratios.channels and self.robot.encoder_lag_s > 0.0:
             wheel = ratios.wheels[ratios.channels.index(channel)]
-            slips = lagged_slip_at(self.run, self.robot, self.track.time_s)
-            return np.asarray(slips[:, self.robot.wheels.index(wheel)])
+            with suppress(KeyError):  # a truth that has no more than the slip gives it as it is
+                slips = lagged_slip_at(self.run, self.robot, self.track.time_s)
+                return np.asarray(slips[:, self.robot.wheels.index(wheel)])
         values = truth.channel(channel)
         if channel == "yaw_rad":
             return np.asarray(wrapped(np.interp(self.track.time_s, truth.time_s, np.unwrap(values))))

@@ -77,6 +77,17 @@ def test_any_filter_gives_the_same_record_and_figures_of_the_same_definition(rob
     assert {"stale_ratio", "observer_code", *(f"std_{name}" for name in found.slip.channels)} <= set(written)
 
 
+def test_a_truth_of_slip_alone_judges_the_slip_and_nothing_else():
+    run = simulate_run(ROBOT, "grass", "straight", 4, poses=Poses(), duration_s=12.0)
+    truth = run.streams["truth"]
+    alone = Stream(truth.time_s, truth.columns(["slip_1_ratio"]), ("slip_1_ratio",))
+    row = summarize(estimate_run(replace(run, streams={**run.streams, "truth": alone}), ROBOT, "slip"))
+    assert row.slip["slip_1_ratio"].true_mean == pytest.approx(0.15, abs=0.03)
+    assert np.isnan(
+        [row.slip["slip_2_ratio"].true_mean, row.slip_true_mean, row.position_rmse_m, row.speed_rmse_mps]
+    ).all()
+
+
 def turned(run, angle_rad):
     """The run as a receiver tells it whose east is turned."""
     gnss = run.streams["gnss"]
