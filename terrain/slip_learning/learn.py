@@ -88,6 +88,7 @@ def terrain_runs(run: RunLog, robot: Robot) -> list[TerrainRun]:
         )
     run, robot = correct(run, robot)
     found = estimate_run(run, robot, FILTER)
+    assert found.table is not None  # as of every filter of a swerve robot
     forces = wheel_forces(run, robot, found.track, found.table, found.slip)
     speed_std_mps = wheel_speed_scatter_mps(robot)
     measured = []
