@@ -86,8 +86,6 @@ STEEPER_RATIO = 0.2
 """m at which the same acceleration takes twice the slip: traction curves flatten."""
 PULL_PER_MPS2, PULL_STD_PER_MPS2, PULL_WALK = 0.1, 0.1, 0.01
 """Of c at first: from asphalt to sand; and its walk within a second of driving."""
-MOST_PULL_MPS2 = 3.0
-"""Acceleration of the wheels beyond which they spin or lock, whatever the ground."""
 YIELDING_RATIO = 0.3
 """Length over the radius of a wheel that it rolls from rest until the contact pulls: tyre and soil yield first, a track
 and a gear have slack; d is then of the order of 1."""
@@ -595,9 +593,7 @@ class SlipFilter(FilterObserver):
         inputs[: 3 * MOST_ROWS], inputs[_SPEEDS][:n], inputs[_TURNING] = rolling.ravel(), known, turning
         if self._robot.skids and size > 0.0:  # turning on the spot says nothing of slip straight ahead
             before_mps = before_mps * (1.0 - min(abs(float(turning[0])) / size, 1.0) ** 2)
-        sticks = np.clip(1.0 - self._slow_of(n), 0.0, 1.0)  # slip ends at 1
-        pulled_mps2 = sticks * np.clip(rates_mps2, -MOST_PULL_MPS2, MOST_PULL_MPS2)
-        inputs[_SMOOTH][:n], inputs[_PULLING][:n] = before_mps, np.abs(before_mps) * pulled_mps2
+        inputs[_SMOOTH][:n], inputs[_PULLING][:n] = before_mps, np.abs(before_mps) * rates_mps2
         inputs[_SIZE - _D :] = size, accel, self._since_fix(rates_mps2, rolling[:n, 0]), *ages
         self.accel_mps2 = accel - float(self.filter.mean[_ACCEL_BIAS])
         return inputs
@@ -630,10 +626,7 @@ class SlipFilter(FilterObserver):
         """
         scatter_mps = self._speed_scatter.std
         std = np.full(MOST_ROWS + 1 + len(_REFERENCES), scatter_mps.max())
-        behind_mps = self._slow_of(len(scatter_mps)) * np.abs(
-            inputs[_SMOOTH][: len(scatter_mps)] - inputs[_SPEEDS][: len(scatter_mps)]
-        )
-        std[: rates_mps2.size] = np.sqrt(scatter_mps**2 + (0.29 * dt_s * rates_mps2) ** 2 + behind_mps**2)
+        std[: rates_mps2.size] = np.hypot(scatter_mps, 0.29 * dt_s * rates_mps2)
         if float(inputs[_SIZE - _D]) < STANDING_MPS:
             std[:MOST_ROWS] = REST_STD_MPS
         if self._robot.skids:

@@ -235,6 +235,55 @@ def test_a_turn_that_begins_late_leaves_the_bias_alone():
         assert (np.abs(error) < 3.0 * track.std(name))[late].all()
 
 
+def test_what_is_lost_in_turning_is_learned_where_the_robot_follows_its_wheels_late():
+    """Turns of 2 s, 0.4 s late: a lag that counted as a loss or none would be some of it."""
+    time_s = PERIOD_S * np.arange(3000)
+    turn = np.where((time_s % 6.0 > 2.0) & (time_s % 6.0 < 4.0), 0.5, 0.0)
+    half = 0.5 * HUSKY.track_m * turn / (1.0 - 0.4)
+    rows = {"speed_left_mps": 0.8 - half, "speed_right_mps": 0.8 + half}
+    rows["yaw_rate_radps"] = np.r_[np.zeros(20), turn[:-20]]
+    rows["yaw_rate_radps"] += np.random.default_rng(0).normal(0.0, 0.002, len(time_s))
+    _, track = run_filter(HUSKY, time_s, rows)
+    assert track.state("turn_loss_ratio")[-1] == pytest.approx(0.4, abs=0.08)
+
+
+def test_an_accelerometer_that_the_ground_shakes_is_believed_less():
+    time_s, rows, _ = drive(HUSKY)
+    rng = np.random.default_rng(1)
+    rows["accel_x_mps2"] = rows["accel_x_mps2"] + rng.normal(0.0, 3.0, len(time_s))
+    for name, std in (
+        ("gnss_x_m", 0.02),
+        ("gnss_y_m", 0.02),
+        ("gnss_speed_x_mps", 0.03),
+        ("gnss_speed_y_mps", 0.03),
+    ):
+        rows[name] = rows[name] + rng.normal(0.0, std, len(time_s))
+    filter_, track = run_filter(HUSKY, time_s, rows)
+    error, late = np.abs(track.slip - 0.1), time_s > 10.0
+    assert np.sqrt(np.mean(error[late] ** 2)) < 0.03
+    assert np.mean(error[late] < 2.0 * track.slip_std[late]) > 0.9
+    assert sum(filter_.filter.dropped.values()) < 5
+
+
+@pytest.mark.parametrize(
+    ("state", "turns_back"), [("passing_slip_0_ratio", False), ("ground_slip_left_ratio", True)]
+)
+def test_on_slippery_ground_slip_changes_by_more(state, turns_back):
+    """Without a reference, by the slip of before: for the same acceleration, and where it turns back."""
+    stds = []
+    for slip in (0.05, 0.4):
+        time_s, rows, _ = drive(HUSKY, slip=slip, accel=False)
+        ahead = np.clip(1.0 - 2.0 * (time_s - 25.0), -1.0, 1.0) if turns_back else np.ones(len(time_s))
+        ahead *= (1.0 - slip) / 0.95  # the wheels turn alike on both grounds
+        for name in ("speed_left_mps", "speed_right_mps", "yaw_rate_radps"):
+            rows[name] = rows[name] * ahead
+        for name in ("gnss_x_m", "gnss_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps"):
+            rows[name] = np.where(time_s > 25.0, np.nan, rows[name] * (1.0 - slip) / 0.95)
+        filter_, _ = run_filter(HUSKY, time_s, rows)
+        stds.append(np.sqrt(filter_.filter.cov.diagonal()[filter_.filter.model.states.index(state)]))
+    assert stds[1] > 1.25 * stds[0]
+
+
 def test_gravity_of_a_slope_is_taken_off_by_the_measured_pitch():
     time_s, rows, _ = drive(HUSKY)
     rows["pitch_rad"] = np.full(len(time_s), -0.1)
