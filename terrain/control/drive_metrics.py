@@ -33,9 +33,9 @@ from terrain.kinematics.logged_wheels import true_slip
 from terrain.kinematics.wheels import wheel_frame_velocities
 from terrain.logs.schema import TWIST
 from terrain.records import Array, RunLog, Stream
-from terrain.robots import Robot
+from terrain.robots import BicycleRobot, Robot
 from terrain.signals import low_pass, true_stretches
-from terrain.simulation.scenario import Scenario
+from terrain.simulation.scenario import Scenario, fastest_mps_of
 
 PEAK_ABOVE_MPS = 0.2  #: Slip is evaluated above this speed: below it is the ratio of two small speeds.
 #: Time constant of the low-pass on slip, the one of its estimate: it removes the slip of single bumps.
@@ -43,6 +43,11 @@ SMOOTH_S = 0.05
 #: A wheel is locked where its circumferential speed is below this fraction of its speed over ground, above this speed
 #: over ground.
 LOCKED_RATIO, LOCKED_ABOVE_MPS = 0.1, 0.1
+#: Turns are evaluated above the first, from the second after a change of the desired twist on, over the third at least.
+TURN_RADPS, TURN_AFTER_S, TURN_LEAST_S = 0.1, 1.5, 0.5
+#: Ground or motors give no more where the robot slips by more, the fastest wheel is commanded to nearly its limit (or a
+#: car's steering, at the speed that it has), or a wheel is so much slower than its command.
+LIMIT_SLIP_RATIO, LIMIT_SPEED_RATIO, LIMIT_BEHIND_RATIO = 0.5, 0.98, 0.8
 STANDING_MPS = 0.02  #: A robot that is slower than this stands.
 #: A robot is immobilised where it is slower than the first for this time while a speed above the last is desired.
 STUCK_MPS, STUCK_S, STUCK_COMMAND_MPS = 0.03, 2.0, 0.2
@@ -71,6 +76,8 @@ METRICS = {
     "sinkage_m": ("sinkage of the deepest wheel", "m"),
     "command_mps2": ("change of the wheels' commands, rms", "m/s²"),
     "yaw_drift_rad": ("change of heading over the drive", "rad"),
+    "turn_error_ratio": ("error of the yaw rate in steady turns", ""),
+    "turn_limit_ratio": ("of their time, at the limit of ground or motors", ""),
 }
 #: Of a start.
 OF_STARTS = "slip_peak", f"distance_{START_TIME_S:g}s_m", f"energy_{START_DISTANCE_M:g}m_j"
@@ -81,6 +88,7 @@ LABELS = METRICS | {
     OF_STARTS[1]: (f"distance within {START_TIME_S:g} s of a start", "m"),
     OF_STARTS[2]: (f"energy of the first {START_DISTANCE_M:g} m", "J"),
 }
+TURNS = "turn_error_ratio", "turn_limit_ratio"  #: Of steady turns.
 #: Metrics of a controller that uses the terrain.
 BELIEF = ("believed_ratio", "n_accepted", "n_below_threshold", "n_refused")
 
@@ -194,6 +202,40 @@ def lock_s(history: DriveHistory, start_s: float = 0.0, end_s: float = math.inf)
     return float(locked[within].sum(axis=0).max() * (history.time_s[1] - history.time_s[0]))
 
 
+def turn_figures(run: RunLog, history: DriveHistory, robot: Robot, scenario: Scenario) -> tuple[float, float]:
+    """Return the error of the yaw rate in steady turns, and in which part of their time ground or motors gave no more.
+
+    The error of a turn is that of its mean yaw rate over the desired one; the mean of those turns, weighted by their
+    time, that ground and motors give, NaN without one.  The part is NaN where nothing turns.
+    """
+    twist, time_s = scenario.twist, scenario.time_s
+    constant = np.concatenate([[False], (np.abs(np.diff(twist, axis=0)) < 1e-9).all(axis=1)])
+    commands, turns = run.streams["commands"], []
+    wheels = commands.columns(f"wheel_{i}_radps" for i in robot.logged_wheels) * robot.wheel_radius_m
+    for first, end in true_stretches(constant & (np.abs(twist[:, 2]) > TURN_RADPS)).tolist():
+        start_s, end_s = time_s[first] + TURN_AFTER_S, time_s[end - 1]
+        if end_s - start_s < TURN_LEAST_S:
+            continue
+        within, given = (
+            (stamps >= start_s) & (stamps <= end_s) for stamps in (history.time_s, commands.time_s)
+        )
+        speed, command = (
+            np.abs(rows.mean(axis=0)) for rows in (history.wheel_speed_mps[within], wheels[given])
+        )
+        yaw, passed_s = (rows[within][-1] - rows[within][0] for rows in (history.yaw_rad, history.time_s))
+        limited = abs(np.nanmean(history.slip_ratio[within])) > LIMIT_SLIP_RATIO
+        limited |= command.max() > LIMIT_SPEED_RATIO * fastest_mps_of(robot)
+        limited |= (speed < LIMIT_BEHIND_RATIO * command - LOCKED_ABOVE_MPS / 2).any()
+        if isinstance(robot, BicycleRobot):
+            most = math.tan(robot.steering_max_rad) / robot.wheelbase_m * history.speed_mps[within].mean()
+            limited |= abs(twist[first, 2]) > LIMIT_SPEED_RATIO * most
+        turns.append((abs(yaw / passed_s / twist[first, 2] - 1.0), limited, end_s - start_s))
+    errors, limits, times_s = np.array(turns).reshape(-1, 3).T
+    kept_s = times_s * (1.0 - limits)
+    error = float(errors @ kept_s / kept_s.sum()) if kept_s.any() else math.nan
+    return error, float(limits @ times_s / times_s.sum()) if times_s.size else math.nan
+
+
 def immobilised(history: DriveHistory, control: Stream) -> int:
     """Return how often the robot was stuck: no motion for :data:`STUCK_S` although one is desired.
 
@@ -280,6 +322,7 @@ def evaluate_drive(
         "sinkage_m": float(history.sinkage_m.mean()),
         "command_mps2": command_change(run.streams["commands"]) * robot.wheel_radius_m,
         "yaw_drift_rad": float(abs(history.yaw_rad[-1] - history.yaw_rad[0])),
+        **dict(zip(TURNS, turn_figures(run, history, robot, scenario), strict=True)),
     } | dict.fromkeys(BELIEF, math.nan)
     if adapting_to is not None:
         known = control.channel("terrain_code")[control.channel("desired_mps") >= DRIVING_MPS] >= 0.0
@@ -387,6 +430,7 @@ REFERENCES = ("true_terrain", "classified", "fallback")
 #: Below this ratio of the driving time with a known terrain, nine tenths of a drive are the fallback's.
 HARDLY_BELIEVED_RATIO = 0.1
 _GENERAL = ("slip_peak", "energy_j_per_m", "distance_m", "final_speed_mps")
+_TURNING = (*TURNS, *_GENERAL)
 #: Metrics that a scenario is about, the most informative first.
 _OF_SCENARIO = {
     "starts": ("slip_peak", "energy_j_per_m", "distance_5s_m", "energy_4m_j", "final_speed_mps"),
@@ -394,13 +438,14 @@ _OF_SCENARIO = {
     "slope": ("steepest_deg", *_GENERAL),
     "circle": ("scrub_j", *_GENERAL),
     "crab": ("scrub_j", *_GENERAL),
+    **dict.fromkeys(("arc", "spot_turn", "complex", "survey"), _TURNING),
     "course": (*_GENERAL, "adapt_s", "adapted_ratio"),
     "mixed": (*_GENERAL, "adapt_s", "adapted_ratio"),
 }
 #: Metrics whose differences are given in their unit; all others relative, as drives differ in size.
-ABSOLUTE = ("steepest_deg", "lock_s", "immobilised", "adapt_s", "adapted_ratio")
+ABSOLUTE = ("steepest_deg", "lock_s", "immobilised", "adapt_s", "adapted_ratio", *TURNS)
 #: Metrics that are compared only where a controller has another value than zero.
-WHERE_ANY = ("immobilised", "lock_s")
+WHERE_ANY = ("immobilised", "lock_s", TURNS[1])
 #: Metrics of controllers whose target follows the terrain; another's may be close to the target by chance.
 ADAPTATION = ("adapt_s", "adapted_ratio")
 Metrics = Mapping[str, float]  #: Metrics of one drive by name; NaN where one is undefined.

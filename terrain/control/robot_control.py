@@ -252,12 +252,16 @@ WINDOW_S, PERSISTS_S, SETTLED_S, SMOOTH_S = 0.4, 0.06, 0.1, 0.04
 STILL_S = 0.16
 #: A second low-pass, and how far the first is ahead of it, in m/s or rad, where a command is approached.
 SLOW_S, APPROACH = 0.2, 0.02
+#: No motor changes the speed of a wheel by so much from sample to sample while its command stays: it is off at once.
+JUMP_MPS = 0.15
 #: Tolerances: of a wheel's speed, a constant and a part of the command, and of a steering angle.
 SPEED_MPS, SPEED_RATIO, STEER_RAD = 0.05, 0.06, 0.06
 
 
 class Actuation:
     """Wheels and steering of a robot against their commands, step by step: which (wheels + angles,) are ``off``.
+
+    ``spikes`` are wheels whose last value alone is none: a second one like it makes them off.
 
     ``mps_per_rate`` is the speed of a wheel by what its channel holds, the rate of its motor or the speed itself.  The
     ground drives the sides of a robot that skids against each other, beyond what their motors can hold: one that moves
@@ -273,9 +277,9 @@ class Actuation:
         size = sum(n)
         self._command = np.full(size, math.nan)
         self._commands: deque[tuple[float, Array]] = deque(maxlen=N_COMMANDS)
-        self._last = self._before = self._smooth = self._slow = np.full(size, math.nan)
+        self._last = self._before = self._middle = self._smooth = self._slow = np.full(size, math.nan)
         self._repeated_s, self._off_s, self._on_s = np.zeros(size), np.zeros(size), np.full(size, SETTLED_S)
-        self.off = np.zeros(size, dtype=np.bool_)
+        self.off = self.spikes = np.zeros(size, dtype=np.bool_)
 
     def commanded(self, wheel_mps: Array, steer_rad: Array) -> None:
         """Take the commands (wheels,), (angles,) that are in force from now on."""
@@ -288,8 +292,12 @@ class Actuation:
             value[:n] = wheels.values[-1, :n] * self._mps_per_rate
         if steer_rad is not None:
             value[n:] = steer_rad
+        passed_s = now_s - self._commands[-1][0] if self._commands else math.inf
+        if not passed_s <= STILL_S:  # so long ago that it shows no jump
+            self._last = self._before = self._middle = np.full(len(value), math.nan)
         last_three = np.array([value, self._last, self._before])
         middle = np.where(np.isnan(last_three).any(axis=0), value, np.sort(last_three, axis=0)[1])
+        change, self._middle = np.abs(middle - self._middle), middle
         self._repeated_s = np.where(value == self._last, self._repeated_s + step_s, 0.0)
         self._last, self._before = value, self._last
         self._smooth, self._slow = smooth, slow = [
@@ -304,8 +312,12 @@ class Actuation:
         known = counts.any(axis=0)
         low = np.where(known, np.where(counts, commands, math.inf).min(axis=0), 0.0)
         high = np.where(known, np.where(counts, commands, -math.inf).max(axis=0), 0.0)
+        limit = JUMP_MPS * max(passed_s / PERIOD_S, 1.0) + np.where(
+            np.arange(len(value)) < n, high - low, math.inf
+        )
+        jumped, self.spikes = change > limit, np.abs(value - middle) > limit
         if self._skids:
-            moves, sides = self._repeated_s < STILL_S, slice(0, self._n)
+            moves, sides = (self._repeated_s < STILL_S) & ~self.off, slice(0, self._n)
             low = np.where(moves, np.minimum(low[sides].min(), 0.0), low)
             high = np.where(moves, np.maximum(high[sides].max(), 0.0), high)
         slack = self._tolerance + self._ratio * np.maximum(np.abs(low), np.abs(high))
@@ -315,7 +327,8 @@ class Actuation:
         self._off_s = np.where(goes, np.where(deviates, self._off_s + step_s, 0.0), self._off_s)
         self._on_s = np.where(goes, np.where(deviates, 0.0, self._on_s + step_s), self._on_s)
         now_off = (self._off_s >= PERSISTS_S) | (self.off & (self._on_s < SETTLED_S))
-        self.off = np.where(goes, now_off, self.off)
+        self.off = np.where(goes, now_off, self.off) | jumped
+        self._on_s[jumped] = 0.0
 
 
 # Order in which sensors are named, by health: one that steps or freezes takes others with it, which are lost.
@@ -389,7 +402,7 @@ class RobotControl:
         self._tilt = [imu.index(angle) for angle in ("roll_rad", "pitch_rad") if angle in imu]
         self._gains = thesis_gains(robot) if settings.controller == "thesis" else THESIS_GAINS
         self._turning = None
-        if settings.controller == "traction" and not robot.steered:
+        if settings.controller == "traction" and not (robot.steered and robot.sideways):
             self._turning = turning_of(robot)
         self.use(table)
         # what a step leaves to the next
@@ -440,7 +453,7 @@ class RobotControl:
         rates = None if wheels is None else Reading(wheels.time_s, wheels.values[:, self._rates])
         steer_rad = None if seen is None else seen.mean[self._steer_states]
         self._actuation.measured(time_s, step_or_period(dt_s), rates, steer_rad)
-        off = self._actuation.off[: len(self._rates)]
+        off = (self._actuation.off | self._actuation.spikes)[: len(self._rates)]
         if wheels is not None and off.any():
             values = wheels.values.copy()
             values[:, np.array(self._rates)[off]] = math.nan

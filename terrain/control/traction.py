@@ -186,6 +186,7 @@ class TractionState(NamedTuple):
 
     driven_mps: float = 0.0  #: d
     desired_mps: float = 0.0  #: w
+    lagged_mps: float = 0.0  #: d behind the lag of what is estimated
     reference_mps: float = 0.0  #: speed that is commanded without a change
     constant_s: float = 0.0  #: for how long it has been
     smooth_mps: float = (
@@ -202,6 +203,8 @@ class TractionState(NamedTuple):
     rate_radpm: tuple[float, ...] = ()  #: of each wheel at w = 1 m/s, of the last command to move
 
 
+#: A command that falls by the second within the first is ahead of the estimate: it shows no slip of that braking yet.
+_LAG_S, _FALLEN_MPS = 0.15, 0.2
 _SLOW_S = 0.5  # window of the speed gain: shorter is noise, longer comes late
 _HELD_S = 0.4  # a robot that was limited for so long has had time to gain speed
 _CONSTANT_S, _CONSTANT_MPS = 0.6, 0.02  # commanded at one speed for so long: what is left is steady motion
@@ -276,6 +279,9 @@ def traction_step(
     if status is TractionStatus.OK and not wheels.stale_s <= settings.stale_max_s:
         status = TractionStatus.STALE
     if status is TractionStatus.OK and not uncertain <= settings.std_max_ratio:
+        status = TractionStatus.UNCERTAIN
+    falls = target.braking_mps2 == 0.0 and state.lagged_mps - desired > _FALLEN_MPS
+    if status is TractionStatus.OK and falls:
         status = TractionStatus.UNCERTAIN
     q = 0.0 if math.isinf(q) else q
     smooth, smooth_mps2 = q, accel
@@ -354,7 +360,8 @@ def traction_step(
             commands[i] -= sign * min(max(droop, -limit), limit)
     braked_from = 0.0 if braking_s == 0.0 else max(state.braked_from_mps, was)
     smooth = smooth if status is TractionStatus.OK else math.nan
-    seen = driven, desired, reference, constant_s, smooth, smooth_mps2, slow
+    lagged = state.lagged_mps + (driven - state.lagged_mps) * min(dt_s / _LAG_S, 1.0)
+    seen = driven, desired, lagged, reference, constant_s, smooth, smooth_mps2, slow
     learned = *seen, balance, floor, held_s, braking_s, braked_from
     slip = math.nan if status is TractionStatus.NO_SLIP else largest_slip
     report = WheelReport(driven, aimed, balance, slip, drive_state, status)

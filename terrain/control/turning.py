@@ -1,4 +1,4 @@
-"""Yaw rate of robots that turn by the speeds of their wheels, kept while the wheels slip differently.
+"""Yaw rate of robots that turn by the speeds of their wheels, or by the steering of a car, kept while wheels slip.
 
 Sides with the speeds u_L and u_R and the distance B between them turn a robot that skids by less than
 ``(u_R - u_L) / B``, as the ground resists.  In a steady turn it is less by the factor 1 / x, as if the sides were the
@@ -32,7 +32,7 @@ import numpy as np
 from terrain.control.pid import LONGEST_STEP_S
 from terrain.kinematics.wheels import rolling_matrix
 from terrain.records import Array
-from terrain.robots import Robot
+from terrain.robots import BicycleRobot, Robot
 
 
 class TurnSettings(NamedTuple):
@@ -81,10 +81,13 @@ class Turning(NamedTuple):
     rolling: Array  #: (wheels, 3)
     skids: bool  #: whether its effective track is another than its track
     limit_mps: float  #: fastest speed of a wheel
+    arm_m: (
+        float  #: by which a change of the yaw rate changes the fastest wheel's speed; of a car its wheelbase
+    )
 
 
 def turning_of(robot: Robot) -> Turning:
-    """Return how a robot turns that is not steered.
+    """Return how a robot turns by its wheels' speeds, or by the steering of a car, whose wheels' speeds do not matter.
 
     Examples
     --------
@@ -92,9 +95,13 @@ def turning_of(robot: Robot) -> Turning:
     >>> turning_of(load_robot("husky")).rolling.round(3).tolist()
     [[1.0, 0.0, -0.285], [1.0, 0.0, 0.285]]
     """
-    place = robot.wheel_positions_m, robot.wheel_directions_rad, robot.roller_angles_rad
     limit_mps = robot.wheel_radius_m * robot.completed.motors.speed_max_radps
-    return Turning(rolling_matrix(*place), robot.skids, limit_mps)
+    if isinstance(robot, BicycleRobot):
+        ahead = np.tile([1.0, 0.0, 0.0], (len(robot.wheels), 1))
+        return Turning(ahead, skids=False, limit_mps=limit_mps, arm_m=robot.wheelbase_m)
+    place = robot.wheel_positions_m, robot.wheel_directions_rad, robot.roller_angles_rad
+    rolling = rolling_matrix(*place)
+    return Turning(rolling, robot.skids, limit_mps, float(np.abs(rolling[:, 2]).max()))
 
 
 def first_state(robot: Robot) -> TurnState:
@@ -164,7 +171,7 @@ def turn_step(
     speeds = turning.rolling[:, :2] @ twist[:2] + arms * desired
     fastest = float(np.abs(speeds).max())
     # by how much the yaw rate may change before a wheel would reverse, in either direction
-    least = most = settings.limit_ratio * fastest / float(np.abs(arms).max())
+    least = most = settings.limit_ratio * fastest / (ratio * turning.arm_m)
     for speed, arm in zip(speeds.tolist(), arms.tolist(), strict=True):
         if speed * arm > 0.0:
             least = min(least, abs(speed / arm))

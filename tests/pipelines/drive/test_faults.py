@@ -119,7 +119,7 @@ def test_a_fault_and_an_exception_of_the_pilot_act_from_when_they_begin_and_show
     row = evaluate_case(LOOP, case, references)
     assert (row.figures.n_exceptions, row.bars["finite"]) == (50, False)
     assert row.exception == "ZeroDivisionError: nothing to divide"
-    assert row.figures.recovery_s < 0.05
+    assert row.bars["recovery"]  # the filter waits for its low-pass after the gap
 
 
 def test_the_report_counts_what_is_met_and_names_what_is_not(few):

@@ -21,9 +21,11 @@ from terrain.control.drive_metrics import (
     slip_peak,
     steepest_grade,
     stopping_distance,
+    turn_figures,
 )
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
+from terrain.simulation.scenario import STAND, Leg, fastest_mps_of, from_legs
 from terrain.slip import slip_ratio
 
 ROBOT = load_robot("agrimaro")
@@ -104,6 +106,27 @@ def test_scrub_is_the_energy_dissipated_along_the_wheels_and_across():
     control = Stream(time_of(), np.ones((1000, 1)), ("desired_mps",))
     slides_back = history(speed_x_mps=-0.5)
     assert (immobilised(found, control), immobilised(slides_back, control)) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("speed_mps", "wheel_mps", "commanded_mps", "figures"),
+    [
+        (0.5, 0.6, 0.6, (0.1, 0.0)),
+        (0.5, 0.6, fastest_mps_of(ROBOT), (math.nan, 1.0)),  # the motors give no more,
+        (0.5, 0.6, 0.9, (math.nan, 1.0)),
+        (0.25, 0.6, 0.6, (math.nan, 1.0)),  # the ground does not
+    ],
+)
+def test_the_error_of_a_turn_counts_where_ground_and_motors_give_it(
+    speed_mps, wheel_mps, commanded_mps, figures
+):
+    scenario = from_legs("turn", "grass", [STAND, Leg(np.array([0.5, 0.0, 0.3]), 8.0)])
+    found = history(speed_x_mps=speed_mps, yaw_rad=0.27 * time_of(), wheel_speed=wheel_mps)
+    rates = np.full((1000, 3), commanded_mps / RADIUS_M)
+    run = RunLog("drive", "", {"commands": Stream(time_of(), rates, tuple(all_wheels(wheel_radps=0)))})
+    assert turn_figures(run, found, ROBOT, scenario) == pytest.approx(figures, nan_ok=True)
+    straight = from_legs("straight", "grass", [STAND, Leg(np.array([0.5, 0.0, 0.0]), 8.0)])
+    assert turn_figures(run, found, ROBOT, straight) == pytest.approx((math.nan, math.nan), nan_ok=True)
 
 
 def test_peak_slip_is_the_mean_over_wheels_above_a_speed_and_ignores_single_samples():

@@ -220,7 +220,18 @@ TWISTS = ((0.6, 0.0, 0.3), (0.6, 0.0, 0.0), (0.3, 0.0, -0.6), (-0.4, 0.0, 0.3))
 
 @pytest.mark.parametrize(  # the last two are beyond what such ground gives tracks
     ("name", "twist"),
-    [(name, twist) for name, n in (("husky", 4), ("marmotte", 2), ("omnirobot", 4)) for twist in TWISTS[:n]],
+    [
+        *(
+            (name, twist)
+            for name, n in (("husky", 4), ("marmotte", 2), ("omnirobot", 4))
+            for twist in TWISTS[:n]
+        ),
+        *(
+            (name, twist)
+            for name in ("adap2e", "pallet_truck")
+            for twist in ((0.6, 0.0, 0.1), (-0.5, 0.0, 0.1))
+        ),
+    ],
 )
 def test_the_commanded_turn_is_kept_while_a_side_slips_more(name, twist):
     robot = ROBOTS[name]

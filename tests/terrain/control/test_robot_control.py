@@ -159,6 +159,20 @@ def test_what_does_not_follow_is_off_within_a_quarter_of_a_second_and_alone(plac
     assert not off[time_s > 3.5].any()
 
 
+@pytest.mark.parametrize("change", [lambda mps: 0.0, lambda mps: 1.2 * mps])
+def test_a_wheel_that_jumps_while_its_command_stays_is_a_spike_at_once_and_then_off(change):
+    actuation, ones, found = Actuation(1.0, skids=True), np.ones(3), []
+    for k in range(100):
+        values = np.where([k < 60, True, True], ones, change(ones))[None]
+        time_s = np.array([k * PERIOD_S])
+        actuation.measured(k * PERIOD_S, PERIOD_S, Reading(time_s, values), np.zeros(3))
+        actuation.commanded(ones, np.zeros(3))
+        found.append((bool(actuation.spikes[0]), bool(actuation.off[0])))
+    assert not np.any(found[:60])
+    assert found[60] == (True, False)
+    assert all(off for _, off in found[61:])
+
+
 def test_what_stands_while_its_command_changes_is_off_and_what_is_not_measured_is_not():
     for place, frozen in ((1, 1.0), (5, 0.3)):
         time_s, off = drive(one(place, lambda value, frozen=frozen: frozen))

@@ -57,7 +57,8 @@ def plain(using, m, aim, radius, wheel, ground, accel, slips, stds, stale, torqu
     certain = not largest > using.std_max_ratio
     fresh = stale <= using.stale_max_s
     checks = {TractionStatus.NO_SLIP: all(known), TractionStatus.STALE: fresh}
-    checks |= {TractionStatus.UNCERTAIN: certain}
+    falls = aim.braking_mps2 == 0 and m["lagged"] - w > traction._FALLEN_MPS
+    checks |= {TractionStatus.UNCERTAIN: certain and not falls}
     status = next((status for status, passed in checks.items() if not passed), TractionStatus.OK)
     target = aim.traction_ratio
     if not math.isnan(m["balance"]):
@@ -78,12 +79,12 @@ def plain(using, m, aim, radius, wheel, ground, accel, slips, stds, stale, torqu
     braking = not rising and (sharply or (m["braking_s"] > 0 and d > w))
     m["w"], braking_s = w, 0.0
     if status != TractionStatus.OK:
-        new, m["held_s"] = min(w, d + using.fade_mps2 * dt), 0.0
+        new, m["held_s"] = min(w, max(d + using.fade_mps2 * dt, using.step_mps)), 0.0
     elif rising:
         led = smooth + using.lead_s * min(max(m["a"], 0.0), using.lead_max_mps2)
         cap = max(led, using.launch_mps) / (1 - min(target, 0.95))
         rise = using.rise_mps2 if smooth > using.launch_mps else using.fade_mps2
-        new = min(w, max(d, min(cap, d + rise * dt)))
+        new = min(w, max(d, min(cap, max(d + rise * dt, using.step_mps))))
         m["held_s"] = m["held_s"] + dt if new < w else 0.0
     else:
         new, m["held_s"] = w, 0.0
@@ -95,6 +96,7 @@ def plain(using, m, aim, radius, wheel, ground, accel, slips, stds, stale, torqu
                 new, braking_s = max(w, min(d, least - spent)), t
     m["from"] = max(m["from"], d) if braking_s > 0 else 0.0
     m["d"], m["braking_s"] = new, braking_s
+    m["lagged"] += (new - m["lagged"]) * min(dt / traction._LAG_S, 1)
     if status == TractionStatus.OK:
         learn(using, m, q, direction, slips, w, target, dt, aim.margin_ratio)
     seen = [direction[i] * torque[i] for i in range(3)]
@@ -135,6 +137,7 @@ def remembered():
     names = (
         "d",
         "w",
+        "lagged",
         "reference",
         "constant_s",
         "q",
@@ -152,7 +155,7 @@ def remembered():
 
 def in_order(m):
     """Its numbers as the state has them; shares as rad/s of a m/s."""
-    return [*list(m.values())[:12], *m["torque"], *(share / RADIUS_M for share in m["share"])]
+    return [*list(m.values())[:13], *m["torque"], *(share / RADIUS_M for share in m["share"])]
 
 
 def numbers_of(state):
@@ -166,6 +169,7 @@ def test_any_drive_with_faults_equals_the_reference_implementation(seed):
     rng = np.random.default_rng(seed)
     changes = {"launch_mps": float(rng.choice([0.01, 0.22])), "droop_time_s": 0.2, "fade_mps2": 1.07}
     changes |= {"smooth_s": rng.choice([0.0, 0.2]), "rise_mps2": rng.choice([1.03, INF])}
+    changes |= {"step_mps": rng.choice([0.0, 0.1])}
     using = settings_of(ROBOT)._replace(**changes)  # no step of a fade is a threshold's
     aim = TractionTarget(rng.uniform(0, 0.6), *(rng.choice([[0.0, 0.0, 0.0], [0.15, 3.0, 0.05]])))
     memory, state = remembered(), TractionState()
@@ -230,6 +234,21 @@ def test_speed_never_falls_while_more_is_desired_and_the_turning_centre_stays(
         assert np.array_equal(back, -command)
         assert np.array_equal(report_back, report, equal_nan=True)
         assert np.array_equal(numbers_of(after_back)[:-3], numbers_of(after)[:-3], equal_nan=True)
+
+
+def test_no_slip_is_believed_before_the_estimate_can_show_a_braking():
+    wheel, moves = np.full(3, 1.0 / RADIUS_M), {"ground_mps": 1.0}
+    _, state, report = steps(TractionState(1.0, 1.0, 1.0), wheel, **moves)
+    statuses = [report.status]
+    for _ in range(20):
+        _, state, report = steps(state, np.zeros(3), **moves)
+        statuses.append(report.status)
+    assert statuses[0] == statuses[-1] == TractionStatus.OK
+    assert set(statuses[1:8]) == {TractionStatus.UNCERTAIN}
+    slower = np.arange(1.0, 0.0, -1.0 * DT_S)  # braking as usual
+    for speed in slower:
+        _, state, report = steps(state, np.full(3, speed / RADIUS_M), ground_mps=speed)
+        assert report.status == TractionStatus.OK
 
 
 def test_a_fix_that_moves_the_speed_in_a_step_moves_the_command_within_its_time():
