@@ -200,15 +200,15 @@ def _keep(
 def report(result: QuickstartResult) -> Report:
     """Return the accuracy and what was predicted first; evaluation, training and slip are folded."""
     evaluation, training, predicted = result.crossval.report, result.train.report, result.predict.report
-    slip = []
+    first = evaluation.parts[:1]
     if result.slip is not None:
         columns = (
             *("terrain", "runs", Column("slip", "+.3f"), Column("true slip", "+.3f")),
             *(Column("RMSE", ".4f"), Column("NEES", ".2f")),
         )
-        table = Table(columns, [tuple(row) for row in result.slip], title="steady slip of the simulated runs")
         worst = max((row.slip_rmse for row in result.slip if math.isfinite(row.slip_rmse)), default=0.0)
-        slip = [Section(f"Slip, at most {format_value(worst, '.4f')} off", [table])]
+        title = f"steady slip of the simulated runs, at most {format_value(worst, '.4f')} off"
+        first = [Table(columns, [tuple(row) for row in result.slip], title=title)]
     predicted_runs = (
         f"Predictions are those of {enumerated(result.held_out)}, held out: the model was neither trained nor "
         "evaluated on them."
@@ -219,12 +219,11 @@ def report(result: QuickstartResult) -> Report:
         evaluation,
         title=f"From logs to slip: {result.dataset}",
         parts=[
-            Section("", [Text(training.answer), Text(predicted_runs), Text(predicted.answer)]),
-            *([slip[0].parts[0]] if slip else evaluation.parts[:1]),
+            Section("", [Text(f"{result.train.verdict}."), Text(predicted_runs), Text(predicted.answer)]),
+            *first,
             Text(f"report: {result.report_file}"),
         ],
         details=[
-            *slip,
             *([Section("A run in detail", result.figures)] if result.figures else []),
             Section("Evaluation and training", [*training.parts, *training.details]),
             Section("Predictions", [*predicted.parts, *predicted.details]),

@@ -39,6 +39,7 @@ def test_the_runs_that_are_predicted_took_no_part(in_tracked, drive_all, tmp_pat
     assert "neither trained nor evaluated on them" in page
     lines = terminal_text(result.report).splitlines()
     assert len(lines) <= 25
+    assert page.count("whole runs held out") == 1  # each thing is said once
     assert lines[0] == result.crossval.report.answer
     found = as_json(result)
     assert json.loads(json.dumps(found, allow_nan=False)) == found
@@ -61,6 +62,7 @@ def test_quickstart_needs_no_data(in_tracked, tmp_path, monkeypatch):
     found = as_json(result)
     assert found["imported"] == {"out": str(tmp_path / "out" / "runs"), "n_runs": 6, "reused": False}
     assert len(found["slip"]) == 3
+    assert result.report_file.read_text().count("steady slip of the simulated runs") == 1
     assert result.commands[0].startswith("terrain simulate --robot agrimaro --terrain all")
     assert (tmp_path / "out" / "report.html").read_text().count('class="plot"') >= 3
     assert len(terminal_text(result.report).splitlines()) <= 25
