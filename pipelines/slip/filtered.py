@@ -335,8 +335,10 @@ def slip_figure(estimate: Estimate) -> Figure:
     """Show each slip over time with two standard deviations, and its truth where there is one."""
     time_s, observed = estimate.track.time_s, estimate.observable
     shown = estimate.slip if observed or estimate.blind is None else estimate.blind
-    away = ~np.isin(estimate.status, (*SETTLED, ObserverStatus.STANDING))
-    strip = Strip(spans(time_s, away, {1: "does not follow measurements"}))
+    follows = (*SETTLED, ObserverStatus.STANDING)
+    strip = Strip(
+        spans(time_s, estimate.status, {int(each): each.label for each in set(ObserverStatus) - set(follows)})
+    )
     panels, mean = [], estimate.figures.steady_mean
     for name, slip, std in zip(shown.channels, shown.mean.T, estimate.slip.std.T, strict=True):
         scale, unit = (np.degrees(1.0), "degrees") if name.endswith("_rad") else (1.0, "ratio")
@@ -349,7 +351,8 @@ def slip_figure(estimate: Estimate) -> Figure:
         label = f"{_words(name)} [{unit}]" if observed else f"{_words(name)}: blind, no slip"
         panels.append(Panel([*marks, strip], label, y_range=_y_range(time_s, scale * slip)))
     title = f"{estimate.run.run_id}: {'slip' if observed else 'slip is not observed'}, {estimate.name}"
-    return Figure(title, panels, "Each slip with two standard deviations.", x_label="time [s]")
+    caption = "Each slip with two standard deviations; shaded with its status where it does not follow measurements."
+    return Figure(title, panels, caption, x_label="time [s]")
 
 
 def path_figure(estimate: Estimate) -> Figure:

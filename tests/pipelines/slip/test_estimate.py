@@ -7,14 +7,19 @@ import pytest
 
 from pipelines.data.datasets import load, load_runs
 from pipelines.data.settings import AlignedRunsSettings
+from pipelines.report.figure import Figure
+from pipelines.report.pages import figure_data
 from pipelines.report.results import silent
 from pipelines.slip.estimate import Settings, estimate_runs, run
+from pipelines.slip.filtered import slip_figure
 from terrain.errors import ConfigError, DataError, LogError
+from terrain.estimation.estimate import estimate_run
 from terrain.logs.run_folders import read_run, write_run
 from terrain.logs.schema import signal_set_of
 from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
+from terrain.simulation.scenario import Faults
 from terrain.simulation.sensors import Gnss
 
 ROBOT = load_robot("agrimaro")
@@ -68,6 +73,18 @@ def test_runs_are_written_with_their_tracks_and_pictures(tmp_path):
     assert f"{straight.run_id}: slip, vio15" in page
     (same,) = estimate_runs([straight], ROBOT, "vio15").runs
     np.testing.assert_array_equal(same.streams["slip"].values, found.streams["slip"].values)
+
+
+def test_a_picture_of_slip_names_why_it_does_not_follow_measurements():
+    lost = drive(duration_s=12.0, faults=Faults(camera_lost_s=((6.0, 9.0),)))
+    panel = slip_figure(estimate_run(lost, ROBOT, "vio15")).panels[0]
+    (strip,) = (
+        mark
+        for mark in figure_data([Figure("", [panel])])[0]["panels"][0]["marks"]
+        if mark["kind"] == "strip"
+    )
+    (predicted,) = [span for span in strip["x"] if span[2] == "predicted"]
+    assert predicted[:2] == pytest.approx((6.1, 9.1), abs=0.3)
 
 
 def test_json_and_report_have_one_shape_whichever_filter_made_them():
