@@ -4,7 +4,7 @@ The body moves with V = (v_x, v_y, w) at its origin, heading psi.  Row i of the 
 a wheel in :math:`D_i` (:func:`terrain.kinematics.wheels.rolling_matrix`), its circumferential speed :math:`u_i` and the
 root mean square U of all of them, is
 
-.. math:: D_i V = u_i (1 - m_i) - \chi\, t_i - c (1 - |m_i|) |u_i| \dot u_i - d_i U .
+.. math:: D_i V = u_i (1 - m_i) - \chi\, t_i - c |u_i| \dot u_i - d_i U .
 
 - **m**, the slip of this ground, of each side of a robot that skids and each wheel that rolls across, else of all
   wheels: a random walk while the robot moves, the same forward and backward, and through standstill.
@@ -155,7 +155,7 @@ _MOTION = (
 )
 _X, _Y, _YAW, _VX, _VY, _W, _GYRO_BIAS, _ACCEL_BIAS, _GNSS_DELAY, _POSE_DELAY, _SLOW = range(11)
 MOST_ROWS = 6  # of a swerve robot: along and across each wheel
-# Places in `params`: counts and levers, the slow state of each row; and as inputs D, u, its mean, t, (1 - m) |u| du/dt,
+# Places in `params`: counts and levers, the slow state of each row; and as inputs D, u, its mean, t, |u| du/dt,
 # U, the acceleration, ages.
 _N_ROWS, _N_SLOW, _TURNS, _FREE_ACROSS, _ANTENNA, _POSED, _SEEN, _GROUP = 0, 1, 2, 3, 4, 6, 8, 10
 _D = _GROUP + MOST_ROWS
