@@ -532,7 +532,7 @@ def _details(result: ExplainResult) -> Iterator[Section]:
     if diagnosis.excluded_runs:
         health.append(Table(("excluded run", WHY), diagnosis.excluded_runs))
     if diagnosis.clocks:
-        late = Column("IMU and camera behind the wheels", ".4f", "s", of="offset_s")
+        late = Column("other sensors behind the wheels", ".4f", "s", of="offset_s")
         std = Column("standard deviation", ".4f", "s", of="std_s")
         health.append(Table((Column("clock of the run", of="run_id"), late, std), diagnosis.clocks))
     yield Section("Health of the logs", health)

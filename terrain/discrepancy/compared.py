@@ -379,7 +379,7 @@ CHANNEL_WORDS = {
     ACCEL: ("accelerometer ahead", "m/s²"),
     CURRENT: ("sum of the motor currents", "A"),
     TURNING_CURRENT: ("right minus left motor current", "A"),
-    HEADING: ("yaw rate from poses", "rad/s"),
+    HEADING: ("yaw rate over ground", "rad/s"),
 }
 #: Inputs of the simulation as axes call them.
 INPUT_LABELS = {

@@ -3,7 +3,7 @@
 Every :data:`BLOCK_S` the last samples are replayed by the extended model, measured and simulated behind one low-pass,
 as runs are by :mod:`terrain.discrepancy.runs`; a log is the same feed, looped.  A channel with residual ``r`` and
 prediction ``p`` has two figures a block: ``along = sum(r p) / |p|``, of a robot that turns or drives more or less than
-its model, and ``level = sum(r) / sqrt(n)``, of one that is off by an amount.  The gyro minus the yaw rate from poses is
+its model, and ``level = sum(r) / sqrt(n)``, of one that is off by an amount.  The gyro minus the yaw rate over ground is
 one more channel.  The file of the model states by how much it is off in quiet runs, which is taken off the figure, and
 the variance of the figure in them, ``noise + scatter e``, where ``e = sum(p^2)``, of the level the sum of the squared
 wheel speed.  ``z`` is the figure over its standard deviation, and over ``sqrt(memory)``: its long-run variance (Newey
@@ -141,9 +141,9 @@ class Alarm(NamedTuple):
         return f"{departure(self.channel, self.kind, self.size)} since {clock_text(self.since_s)}{of_run}"
 
 
-BESIDE = "gyro_beside_poses_radps"  #: The gyro minus the yaw rate from poses: how a ground turns a robot is in both.
+BESIDE = "gyro_beside_poses_radps"  #: The gyro minus the yaw rate over ground: how a ground turns a robot is in both.
 NAMES = (*CHANNELS, BESIDE)
-WORDS = {**CHANNEL_WORDS, BESIDE: ("gyro minus yaw rate from poses", "rad/s")}
+WORDS = {**CHANNEL_WORDS, BESIDE: ("gyro minus yaw rate over ground", "rad/s")}
 
 ALONG = {
     BESIDE: ("gyro reads", "more", "less"),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.explain.explain import explain
+from pipelines.report.pages import markdown_text
 from terrain.robots import load_robot
 from terrain.simulation.plants.planar import Ground, spread_numbers
 from terrain.simulation.run import simulate
@@ -23,7 +24,11 @@ def test_an_effective_track_is_named_without_imu_camera_or_lidar():
         twist[:25] *= np.linspace(0.0, 1.0, 25)[:, None]
         run = simulate(robot, twist, Ground(), i, run_id=f"run_{i}", fixes=True, **about)
         runs.append(replace(run, streams={name: run.streams[name] for name in ("wheels", "gnss")}))
-    causes = {cause.name: cause for cause in explain(runs, robot).diagnosis.causes}
+    explanation = explain(runs, robot)
+    text = markdown_text(explanation.report)
+    assert "yaw rate over ground" in text
+    assert "from poses" not in text  # it has none
+    causes = {cause.name: cause for cause in explanation.diagnosis.causes}
     assert set(causes) == {"effective_track"}
     (value,) = causes["effective_track"].parameters
     assert abs(value.value - 0.5) < 0.05
