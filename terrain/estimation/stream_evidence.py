@@ -52,7 +52,7 @@ SIGNED_MPS = 0.1  #: A robot that is slower may drive in either direction.
 #: Gyro against wheels: memories of what they are apart by, and of the wheels' turn, which the body follows later; of
 #: what is usual.  Further apart than the last number, than so many times its median, and than a part of the turn is a
 #: gyro or a side that measures something else: the median is 0.005 rad/s on smooth ground, and 0.03 on rough one.
-TURNS_S, FOLLOWS_S, USUAL_S, TURN_JUMPS, TURN_RATIO, TURN_RADPS = (0.1, 0.5), 0.5, 5.0, 7.0, 0.5, 0.06
+TURNS_S, FOLLOWS_S, USUAL_S, TURN_JUMPS, TURN_RATIO, TURN_RADPS = (0.1, 0.5), 0.5, 5.0, 7.0, 1.0, 0.06
 OUTLIER_RADPS = 0.25  #: One sample that is further apart moves a memory by no more than this would.
 _SPEEDS = ("camera_speed", "lidar_speed", "gnss_speed")
 _REFERENCES = ("odometry", "lidar", "pose", "gnss")
@@ -122,20 +122,23 @@ class Turns(NamedTuple):
     def after(self, gyro_radps: float, wheels_radps: float, dt_s: float) -> Turns:
         """Return what is known after a step; an unknown rate shows nothing."""
         apart = gyro_radps - wheels_radps
-        if math.isnan(apart):
+        if not math.isfinite(apart):
             return self
         if math.isnan(self.usual_radps) or self.apart_s > BELIEVED_S:
-            return Turns(np.full(2, apart), self.scatter_radps, apart, wheels_radps)
+            usual = apart if abs(wheels_radps) < TURN_RADPS else 0.0  # tight turns show nothing of it
+            return Turns(np.full(2, apart), self.scatter_radps, usual, wheels_radps)
         late, slow = (-math.expm1(-dt_s / time_s) for time_s in (FOLLOWS_S, USUAL_S))
         gap = np.clip(apart - self.apart_radps, -OUTLIER_RADPS, OUTLIER_RADPS)
         memories = self.apart_radps - np.expm1(-dt_s / np.array(TURNS_S)) * gap
         behind = self.wheels_radps + late * (wheels_radps - self.wheels_radps)
         beyond, known_s = np.abs(memories - self.usual_radps), self.known_s + dt_s
         scatter = self.scatter_radps * np.exp(slow * np.sign(beyond - self.scatter_radps))
-        limit = np.maximum(TURN_JUMPS * self.scatter_radps, TURN_RADPS)
         turning = abs(wheels_radps - behind) + TURN_RATIO * min(abs(wheels_radps), abs(gyro_radps))
-        if (beyond > limit + turning).any() or (self.apart_s and beyond[0] > 0.5 * limit[0]):
+        limit = np.maximum(TURN_JUMPS * self.scatter_radps, TURN_RADPS) + turning
+        if (beyond > limit).any() or (self.apart_s and beyond[0] > 0.5 * limit[0]):
             return Turns(memories, scatter, self.usual_radps, behind, known_s, self.apart_s + dt_s)
+        if turning > TURN_RADPS:
+            return Turns(memories, self.scatter_radps, self.usual_radps, behind, known_s)
         usual = self.usual_radps + max(slow, dt_s / known_s) * (float(memories[0]) - self.usual_radps)
         return Turns(memories, scatter, usual, behind, known_s)
 
@@ -176,6 +179,7 @@ class StreamEvidence:
         self._delays = {stream: states.index(name) for stream, name in delays.items() if name in states}
         self._delay_s = dict.fromkeys(self._delays, 0.0)
         self._turns, self._track_m = Turns(), robot.track_m if robot.skids else math.nan
+        self._rates_radps: list[float] = []
         self._turn_loss = states.index("turn_loss_ratio") if "turn_loss_ratio" in states else None
         self._gained_mps = 0.0
         self._gained: deque[tuple[float, float, float]] = deque(maxlen=N_GAINED)
@@ -251,13 +255,14 @@ class StreamEvidence:
         self._gained.append((now_s, gained_mps, wheels_mps))
 
     def _compare_turns(self, dt_s: float, readings: Mapping[str, Reading], motion: LiveEstimate) -> None:
-        """Compare the gyro's last rate with the turn that the wheels of a robot that skids make."""
+        """Compare the middle one of the gyro's last rates with the turn that the wheels of a robot that skids make."""
         values = None if self._gyro is None else self._values(self._gyro, readings)
         if self._gyro is not None and values is not None and len(values):
             left, right = motion.wheel_speed_mps[[0, -1]].tolist()
             loss = 0.0 if self._turn_loss is None else float(motion.mean[self._turn_loss])
             turn_radps = (1.0 - loss) * (right - left) / self._track_m
-            self._turns = self._turns.after(float(values[-1, self._gyro.columns[0]]), turn_radps, dt_s)
+            self._rates_radps = [*self._rates_radps[-2:], float(values[-1, self._gyro.columns[0]])]
+            self._turns = self._turns.after(float(np.median(self._rates_radps)), turn_radps, dt_s)
 
     def _take(self, seen: _Seen, now_s: float, stamp_s: float, row: Array, moves: bool) -> None:
         """Remember a sample, and by how much it differs from what the one before lets expect."""

@@ -213,6 +213,19 @@ def test_a_gyro_that_turns_otherwise_than_the_wheels_is_named_within_a_quarter_o
         assert (found[name][round((FAULT_S + 1.25) / DT_S) :] == Health.FRESH).all(), name
 
 
+@pytest.mark.parametrize(("value", "every"), [(np.inf, 1), (1e6, 10), (np.nan, 10)])
+def test_a_gyro_that_measures_no_rate_or_spikes_does_not_turn_otherwise_than_the_wheels(value, every):
+    def change(name, time_s, row):
+        if name == "imu" and FAULT_S <= time_s < FAULT_S + 1.0 and round(time_s / DT_S) % every == 0:
+            row[CHANNELS["imu"].index("gyro_z_radps")] = value
+        return row
+
+    found = judged(change)
+    for name in SENSORS_OF["wheels"]:
+        assert (found[name] == Health.FRESH).all(), name
+    assert (found["gyro"][round((FAULT_S + 1.1) / DT_S) :] == Health.FRESH).all()
+
+
 def test_rough_ground_that_turns_the_robot_to_and_fro_is_no_fault_once_it_is_known():
     """A yaw rate of 0.05 rad/s, correlated over a tenth of a second, as a Husky has on sandy loam."""
     turns, rng, rate, named = Turns(), np.random.default_rng(0), 0.0, []
