@@ -39,7 +39,7 @@ def test_the_runs_that_are_predicted_took_no_part(in_tracked, drive_all, tmp_pat
     assert "neither trained nor evaluated on them" in page
     lines = terminal_text(result.report).splitlines()
     assert len(lines) <= 25
-    assert page.count("whole runs held out") == 1  # each thing is said once
+    assert page.count("whole runs held out") == 1  # once
     assert lines[0] == result.crossval.report.answer
     found = as_json(result)
     assert json.loads(json.dumps(found, allow_nan=False)) == found
