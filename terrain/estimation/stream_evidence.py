@@ -96,7 +96,7 @@ class _Seen:
         self.value, self.shown = np.empty(0), np.zeros(2)
         self.came_s, self.jumped_s, self.period_s, self.apart = math.nan, math.nan, 0.0, 0.0
         self.scatter = self.usual = SCATTER_MPS
-        self.jumped, self.n_after = np.zeros(1), 0
+        self.jumped, self.n_after, self.limit = np.zeros(1), 0, math.inf  # by which it was one
         self.jump, self.jump_per_s = math.inf, 0.0  # how far it may jump at once, and a second
         if sensor.name in _SPEEDS:
             self.jump = SPEED_JUMP_MPS
@@ -344,8 +344,8 @@ def _sum_jumps(seen: _Seen, stamp_s: float, change: Array, limit: float) -> None
     if math.hypot(*change.tolist()) > limit:
         goes_on = seen.jumped.any() and seen.n_after == 1 and float(change @ seen.jumped) > 0.0
         seen.jumped = np.zeros(1) if goes_on else seen.jumped + change
-        seen.jumped_s, seen.n_after = stamp_s, 0
-    if math.hypot(*seen.jumped.tolist()) <= limit or stamp_s - seen.jumped_s > BELIEVED_S:
+        seen.jumped_s, seen.n_after, seen.limit = stamp_s, 0, limit
+    if math.hypot(*seen.jumped.tolist()) <= min(limit, seen.limit) or stamp_s - seen.jumped_s > BELIEVED_S:
         seen.jumped = np.zeros(1)
 
 

@@ -163,6 +163,18 @@ def test_a_robot_that_stands_has_the_speed_that_jumps_less_than_one_that_drives_
         assert found[-1] == last
 
 
+def test_a_speed_that_jumped_on_a_robot_that_stands_has_as_it_drives_off():
+    source, monitor = StreamEvidence(ROBOT, CHANNELS, SENSORS), HealthMonitor(SENSORS)
+    for k in range(100):
+        speed = max(k - 60, 0) * 0.01
+        row = np.array([speed + 0.3 * (k >= 50) + 0.001 * (k % 3), 0.0])
+        motion = {"time_s": k * DT_S, "reference_age_s": 0.0, "speed_x_mps": speed, "accel_x_mps2": 0.0}
+        motion |= {"wheel_speed_mps": np.full(2, speed)}
+        given = {"odometry": Reading(np.array([k * DT_S]), row[None])}
+        monitor.judge(source.at(k * DT_S, DT_S, given, SimpleNamespace(**motion)))
+        assert (monitor.by_name["camera_speed"] == "stepped") == (k > 50), k
+
+
 def coarse(alone):
     """Rates of wheels that turn evenly and are rounded, from the fault on; or of the left one only."""
 
