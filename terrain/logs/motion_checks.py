@@ -4,9 +4,14 @@ Speeds and turns of a robot are seen by several sensors: wheels, gyro, a lidar o
 Each becomes the mean of a second on one grid: the change of an angle or a position over that second, or of the integral
 of a rate or a speed, so that sensors of any rate compare.  Two clocks may be apart (:data:`SHIFTS_S`).
 
-**Turns.**  A course that is measured turns as the body does; with the velocity v of the ground and the yaw rate w of
-the body, ``v x dv/dt = w |v|^2`` where the robot drives along one axis, forward or back, whatever the frame's
-direction; x and y exchanged turn the sign.  No yaw angle is needed.
+**Speeds.**  A unit is one factor at every moment, slip is not: a factor is stated where nine of ten points are beyond
+what is expected, and of wheels that are faster than the ground where it is the same while their speed varies.
+
+**Turns.**  Velocities of a course are those that speed and integrated yaw rate give, rotated by an unknown angle; with
+x and y exchanged they are their mirror image.  As complex numbers p and g, ``|sum(conj(p) g)|`` and ``|sum(p g)|`` over
+stretches of a minute, in which the gyro drifts little, tell one from the other.  No yaw angle is needed.
+
+**Clocks.**  What is as alike as it can be only seconds apart was stamped by clocks that are apart, or came late.
 
 **Who is wrong.**  Of three sensors the one is named that two others contradict; of two the second.
 
@@ -40,10 +45,24 @@ MAX_OTHER_LIKENESS = 0.3  #: A regular to and fro is like both signs at some shi
 DOUBTFUL_RATIO = 1.5
 DOUBTFUL_TURN_RATIO = 2.0  #: Scans that were matched in turns are off by more than positions.
 IMPLAUSIBLE_RATIO = 3.0
-#: Ground speed over that of wheels: they slip by any part, so that less than so much is doubtful, and no more.
+#: A factor that is the same at nine of ten points within this, at speeds that differ by more, is one of units.
+ONE_FACTOR, MIN_SPEED_RATIO = 1.45, 1.5
+MAX_STEADY_FACTOR = 7.0  #: Wheels that spin steadily are faster by more than km/h and rad/s make them
+#: Accelerations over those of wheels: they slip by any part, so that less than so much is doubtful, and no more.
 LEAST_OF_WHEELS = 0.3
+MIN_TURN_CHANGE_RADPS = (
+    0.01  #: Standard deviation of a yaw rate from which its changes tell a sign, whatever the bias
+)
+COURSE_POINTS = 300  #: A minute
+#: A mirror explains at least so much of a course, and so much more of it than a rotation, and so many deviations.
+MIN_MIRROR, MIN_OVER_ROTATION, MIN_SIGMAS = 0.7, 0.01, 5.0
+MEAN_POINTS = round(1.0 / 0.2)  #: that share a mean of a second
+GOES_ON = 0.8  #: Distance over path in five seconds, of a robot that drives; noise has 0.4.
+#: Clocks that are further apart than SHIFTS_S are looked for by this, and found where signals are this alike there.
+FAR_SHIFTS_S, MIN_FAR_LIKENESS, MIN_FAR_GAIN = np.arange(-12.0, 12.1, 0.2), 0.9, 0.2
 #: Part of the power of the velocity along the body's x axis, of a robot that cannot drive sideways.
 MIN_AHEAD = (0.5, 0.1)
+RECEIVER_RATIO = 1.25  #: Of a receiver's positions and speeds, which do not slip.
 STILL_M = 5e-4  #: No receiver's positions stay within this for seconds, the robot's being stuck or not.
 MIN_DRIVEN_M = 2.0
 STEERING_RATE_RADPS = 20.0  #: No steering is faster.
@@ -51,6 +70,10 @@ MAX_STD_OF_FIX_M = 1.0
 #: Part of the speeds of steered wheels that no twist explains, from which, and over that of turned angles beyond which,
 #: the sign of the steering is turned: sound wheels that slip contradict each other by 0.02.
 CONTRADICTION, OVER_TURNED = 0.05, 3.0
+MIN_FORCE_MPS2, MOSTLY = (
+    0.3,
+    0.9,
+)  #: Ahead, beyond what an IMU that is mounted askew shows; part of the points
 MIN_ACCELERATION_MPS2 = 0.15
 MIN_TILT_RATE_RADPS = 0.003  #: Means of a second; noise of both is less
 MIN_TILT_RAD = 0.02  #: Less is that of a floor, and of offsets.
@@ -58,10 +81,12 @@ MIN_CERTAIN_POINTS = (
     50  #: A run of 10 s; of a shorter one, noise and a shift of clocks may look like a mistake
 )
 WHEELS, ACCELEROMETER = "the wheels", "the accelerometer"
+SIDES = "the turn of the wheels"  #: Of a robot that turns by them, which skids.
 #: Factors of usual mistakes.
 SPEED_FACTORS: Mapping[str, float] = {"km/h": 3.6, "cm": 100.0, "mm": 1000.0}
 GNSS_FACTORS: Mapping[str, float] = {"knots": 1.9438}
 TURN_FACTORS: Mapping[str, float] = {"degrees": 57.2958, "rpm": 9.5493}
+UNNAMED = "another unit, or scale?"
 WITHIN = 1.15  #: A ratio is that of a mistake within this factor: slip and scales are on top
 
 
@@ -102,8 +127,8 @@ class Seen(NamedTuple):
     )
     in_body: bool = False
     yaw_rate_radps: Array | None = None  #: (n,)
-    power: Array | None = None  #: squared speed of a course, by which its turn is weighted
-    acceleration_mps2: Array | None = None  #: (n,) ahead, with what gravity adds
+    course_mps: Array | None = None  #: (n, 2) in a fixed frame
+    acceleration_mps2: Array | None = None  #: (n, 1 or 2) ahead, and to the left, with what gravity adds
 
 
 def motion_findings(run: RunLog, robot: Described) -> list[Finding]:
@@ -119,7 +144,7 @@ def motion_findings(run: RunLog, robot: Described) -> list[Finding]:
     >>> run = RunLog("a", "husky", {"odometry": camera})
     >>> [found.sentence for found in motion_findings(run, Described(twist=Stream(t, v, camera.channels)))
     ...  if found.level == 2]
-    ['speed: that of odometry is 3.6 times that of the wheels, 0.3 to 1.5 is expected: km/h?']
+    ['speed: that of odometry is 3.6 times that of the wheels, 0.67 to 1.5 is expected: km/h?']
     """
     grid_s = _grid(run)
     if len(grid_s) < MIN_POINTS:
@@ -127,12 +152,14 @@ def motion_findings(run: RunLog, robot: Described) -> list[Finding]:
     sources = _sources(run, robot, grid_s)
     return [
         *_compared(sources, robot),
+        *_clocks(sources),
         *_still_positions(run, sources),
         *_attitude(run, grid_s),
         *_tilt_rates(run, grid_s),
         *_steering(run, robot, grid_s),
         *_receiver(run),
         *_currents(run, robot),
+        *_efforts(run, sources, grid_s),
     ]
 
 
@@ -161,7 +188,7 @@ def joint_findings(runs: Sequence[tuple[RunLog, Described]]) -> list[Finding]:
             joined(k, "velocity_mps"),
             seen.in_body,
             joined(k, "yaw_rate_radps"),
-            joined(k, "power"),
+            joined(k, "course_mps"),
             joined(k, "acceleration_mps2"),
         )
         for k, seen in enumerate(parts[0])
@@ -178,7 +205,8 @@ def is_short(run: RunLog) -> bool:
 
 def _compared(sources: Sequence[Seen], robot: Described) -> list[Finding]:
     pairs = _speeds(sources, robot), _yaw_rates(sources, robot), _directions(sources, robot)
-    return [*pairs[0], *pairs[1], *pairs[2], *_course_of_receiver(sources), *_acceleration(sources)]
+    others = _reversed_side(sources), _receivers_axes(sources), _acceleration(sources)
+    return [found for each in (*pairs, *others) for found in each]
 
 
 # -- What each sensor shows, a mean of a second ---------------------------------------------------------------
@@ -233,17 +261,6 @@ def _plane(stream: Stream, names: Sequence[str], grid_s: Array, *, of_rate: bool
     )
 
 
-def _course(velocity_mps: Array) -> tuple[Array, Array]:
-    """Return the yaw rate of a course times its squared speed, and that."""
-    power = (velocity_mps**2).sum(axis=1)
-    turn = np.full(len(power), np.nan)
-    ahead, behind = velocity_mps[2:], velocity_mps[:-2]
-    now = velocity_mps[1:-1]
-    change = (ahead - behind) / (2.0 * STEP_S)
-    turn[1:-1] = now[:, 0] * change[:, 1] - now[:, 1] * change[:, 0]
-    return turn, power
-
-
 def _to_body(velocity_mps: Array, time_s: Array, yaw_rad: Array, grid_s: Array) -> Array:
     """Return velocities (n, 2) of a fixed frame along the axes of a body of this yaw."""
     known = np.isfinite(yaw_rad)
@@ -263,9 +280,12 @@ def _sources(run: RunLog, robot: Described, grid_s: Array) -> list[Seen]:
     turn: Array | None
     if (twist := robot.twist) is not None:
         sides = "wheels" in run.streams and "speed_left_mps" in run.streams["wheels"].channels
-        turn = None if sides else _change(twist.time_s, twist.channel(TWIST[2]), grid_s, of_rate=True)
-        ahead = _change(twist.time_s, twist.channel(TWIST[0]), grid_s, of_rate=False)
-        sources.append(Seen(WHEELS, _plane(twist, SPEEDS, grid_s, of_rate=True), True, turn, None, ahead))
+        turn = _change(twist.time_s, twist.channel(TWIST[2]), grid_s, of_rate=True)
+        ahead = _change(twist.time_s, twist.channel(TWIST[0]), grid_s, of_rate=False)[:, None]
+        velocity = _plane(twist, SPEEDS, grid_s, of_rate=True)
+        sources.append(Seen(WHEELS, velocity, True, None if sides else turn, None, ahead))
+        if sides:
+            sources.append(Seen(SIDES, yaw_rate_radps=turn))
     for name in ("lidar", "odometry", "pose", "gnss", "imu", "compass"):
         stream = run.streams.get(name)
         if stream is None:
@@ -277,9 +297,11 @@ def _sources(run: RunLog, robot: Described, grid_s: Array) -> list[Seen]:
         if name == "imu" and turn is not None:
             sources.insert(0, Seen("the gyro", yaw_rate_radps=turn))
             turn = None
-        if name == "imu" and "accel_x_mps2" in has:
-            ahead = _change(t, stream.channel("accel_x_mps2"), grid_s, of_rate=True)
-            sources.append(Seen(ACCELEROMETER, acceleration_mps2=ahead))
+        if (
+            name == "imu"
+            and (force := _plane(stream, ("accel_x_mps2", "accel_y_mps2"), grid_s, of_rate=True)) is not None
+        ):
+            sources.append(Seen(ACCELEROMETER, acceleration_mps2=force))
         if "yaw_rad" in has:
             turn = _angle_rate(t, stream.channel("yaw_rad"), grid_s)
         body = _plane(stream, SPEEDS, grid_s, of_rate=True)
@@ -293,11 +315,20 @@ def _sources(run: RunLog, robot: Described, grid_s: Array) -> list[Seen]:
         for words, names, of_rate in (("velocity", VELOCITIES, True), ("position", POSITIONS, False)):
             velocity = _plane(stream, names, grid_s, of_rate=of_rate)
             if velocity is not None:
-                course = _course(velocity)
+                course = velocity
                 if in_body := name == "pose" and "yaw_rad" in has:
                     velocity = _to_body(velocity, t, stream.channel("yaw_rad"), grid_s)
+                elif (
+                    name == "gnss"
+                    and "compass" in run.streams
+                    and "yaw_rad" in run.streams["compass"].channels
+                ):
+                    compass, in_body = run.streams["compass"], True
+                    velocity = _to_body(velocity, compass.time_s, compass.channel("yaw_rad"), grid_s)
                 one = name == "pose" or not set(VELOCITIES) <= has
-                sources.append(Seen(name if one else f"the {words} of {name}", velocity, in_body, *course))
+                sources.append(
+                    Seen(name if one else f"the {words} of {name}", velocity, in_body, None, course)
+                )
     return sources
 
 
@@ -313,6 +344,7 @@ class Likeness(NamedTuple):
     least: float = 0.0  #: the smaller of both root mean squares
     most: float = 0.0  #: the larger
     n: int = 0
+    shift: int = 0  #: steps by which the measured one is later
 
     @property
     def is_known(self) -> bool:
@@ -320,12 +352,22 @@ class Likeness(NamedTuple):
         return abs(self.cosine) >= MIN_LIKENESS and self.other <= MAX_OTHER_LIKENESS
 
 
-def _compare(measured: Array, reference: Array, *, about_mean: bool = False) -> Likeness:
-    """Compare signals (n, c) at shifts of up to :data:`SHIFTS_S`; all columns count as one."""
+def _shifted(measured: Array, reference: Array, shift: int) -> tuple[Array, Array]:
+    return (
+        measured[max(shift, 0) : len(measured) + min(shift, 0)],
+        reference[max(-shift, 0) : len(reference) + min(-shift, 0)],
+    )
+
+
+def _compare(
+    measured: Array, reference: Array, shifts_s: Array = SHIFTS_S, *, about_mean: bool = False
+) -> Likeness:
+    """Compare signals (n, c) at some shifts; all columns count as one."""
     fits = []
-    for shift in np.round(SHIFTS_S / STEP_S).astype(int).tolist():
-        a = measured[max(shift, 0) : len(measured) + min(shift, 0)]
-        b = reference[max(-shift, 0) : len(reference) + min(-shift, 0)]
+    for shift in np.round(shifts_s / STEP_S).astype(int).tolist():
+        if abs(shift) >= len(measured):
+            continue
+        a, b = _shifted(measured, reference, shift)
         both = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
         if (n := int(both.sum())) < MIN_POINTS:
             continue
@@ -335,7 +377,9 @@ def _compare(measured: Array, reference: Array, *, about_mean: bool = False) -> 
             m, r = m - m.mean(axis=0), r - r.mean(axis=0)
         cosine = float(agreement(m.reshape(-1, 1), r.reshape(-1, 1))[0][0])
         fits.append(
-            Likeness(cosine, of_m / of_r if of_r else math.inf, 0.0, min(of_m, of_r), max(of_m, of_r), n)
+            Likeness(
+                cosine, of_m / of_r if of_r else math.inf, 0.0, min(of_m, of_r), max(of_m, of_r), n, shift
+            )
         )
     if not fits:
         return Likeness()
@@ -353,7 +397,7 @@ def mistake(ratio: float, factors: Mapping[str, float]) -> str:
     """
     factor = max(ratio, 1.0 / ratio) if ratio > 0.0 else math.inf
     near = min(factors, key=lambda name: abs(math.log(factor / factors[name])))
-    return f"{near}?" if 1.0 / WITHIN < factor / factors[near] < WITHIN else "another unit, or scale?"
+    return f"{near}?" if 1.0 / WITHIN < factor / factors[near] < WITHIN else UNNAMED
 
 
 def _level(n: int, odd: bool | np.bool_, beyond: bool | np.bool_) -> int:
@@ -397,40 +441,78 @@ def _speeds(sources: Sequence[Seen], robot: Described) -> list[Finding]:
             else np.minimum(values, speed[middle])
         )
         goes = _turn_speed(sources, robot) < 0.5 * slow
-        by = _compare(
-            *(np.where(goes, each, np.nan)[:, None] for each in (values, speed[middle])), about_mean=True
-        )
-        low, high, least, most = (
-            1.0 / DOUBTFUL_RATIO,
-            DOUBTFUL_RATIO,
-            1.0 / IMPLAUSIBLE_RATIO,
-            IMPLAUSIBLE_RATIO,
-        )
-        if middle == WHEELS:
-            low, least = LEAST_OF_WHEELS, 0.0
-        elif name == WHEELS:
-            high, most = 1.0 / LEAST_OF_WHEELS, math.inf
-        if not 0.0 < by.ratio < math.inf or by.most < MIN_SPEED_MPS:
+        pair = [np.where(goes, each, np.nan) for each in (values, speed[middle])]
+        by = _compare(pair[0][:, None], pair[1][:, None], about_mean=True)
+        a, b = _shifted(*pair, by.shift)
+        factor = _factor(a, b, MIN_SPEED_MPS)
+        n, ratio = factor.n, factor.ratio
+        if n < MIN_POINTS or not 0.0 < ratio < math.inf:
             continue
-        of = f"speed: that of {name} is {by.ratio:.3g} times that of {middle}"
-        known = factors | dict(GNSS_FACTORS if "gnss" in (name + middle) else {})
-        slips = (middle == WHEELS and by.ratio < 1.0) or (name == WHEELS and by.ratio > 1.0)
-        why = "wheels that slip, or " * slips + mistake(by.ratio, known)
+        of = f"speed: that of {name} is {ratio:.3g} times that of {middle}"
+        mistakes = factors | dict(GNSS_FACTORS if "gnss" in (name + middle) else {})
+        slips = (middle == WHEELS and ratio < 1.0) or (name == WHEELS and ratio > 1.0)
+        why = "wheels that slip, or " * slips + mistake(ratio, mistakes)
+        low, high = 1.0 / DOUBTFUL_RATIO, DOUBTFUL_RATIO
         odd = f"{of}, {low:.2g} to {high:.2g} is expected: {why}"
-        beyond = not least <= by.ratio <= most
-        judged = _level(by.n, not low <= by.ratio <= high, beyond)
+        differs = factor.most < low or factor.least > high
+        beyond = factor.most < 1.0 / IMPLAUSIBLE_RATIO or factor.least > IMPLAUSIBLE_RATIO
+        if slips:
+            named = max(ratio, 1.0 / ratio) < MAX_STEADY_FACTOR and not why.endswith(UNNAMED)
+            differs, beyond = differs and factor.is_one and (factor.varies or named), False
+        judged = _level(n, differs, beyond)
         if by.cosine < MIN_LIKENESS:  # of two steady speeds; noise of a receiver at rest is a speed, too
-            noisy = by.n < MIN_CERTAIN_POINTS or ("gnss" in (name + middle) and by.cosine < 0.5)
+            noisy = n < MIN_CERTAIN_POINTS or not all(
+                _goes_on(each.velocity_mps)
+                for each in sources
+                if each.velocity_mps is not None and "gnss" in each.name and each.name in (name, middle)
+            )
             judged = 0 if noisy else min(judged, 1)
         place = WHEELS if WHEELS in (name, middle) and len(ranked) == 2 else name
-        found.append(Finding("speed", judged, place, by.ratio, odd if judged else of))
+        found.append(Finding("speed", judged, place, ratio, odd if judged else of))
     return found
+
+
+class Factor(NamedTuple):
+    """The factor between two signals at points at which there is motion: at one in ten, one in two, nine in ten."""
+
+    least: float = math.nan
+    ratio: float = math.nan
+    most: float = math.nan
+    n: int = 0
+    is_one: bool = False  #: whether it is the same at nearly all points,
+    varies: bool = False  #: and the signals vary meanwhile, as slip would with them
+
+
+def _factor(measured: Array, reference: Array, least_motion: float) -> Factor:
+    """Compare signals (n,) where the reference moves, or the measured one where it never does."""
+    a, b = np.abs(measured), np.abs(reference)
+    known = np.isfinite(a + b)
+    if known.sum() < MIN_POINTS:
+        return Factor()
+    moving = b if np.quantile(b[known], 0.9) >= least_motion else a
+    moves = known & (moving > max(least_motion, 0.3 * float(np.quantile(moving[known], 0.9))))
+    if moves.sum() < MIN_POINTS:
+        return Factor()
+    with np.errstate(divide="ignore"):
+        least, ratio, most = np.quantile(a[moves] / b[moves], [0.1, 0.5, 0.9], method="nearest").tolist()
+    slow, fast = np.quantile(moving[moves], [0.1, 0.9])
+    is_one, varies = most < ONE_FACTOR * least, bool(fast > MIN_SPEED_RATIO * slow)
+    return Factor(least, ratio, most, int(moves.sum()), is_one, varies)
+
+
+def _goes_on(velocity_mps: Array) -> bool:
+    """Return whether velocities (n, 2) keep their direction for some seconds, which noise does not."""
+    known = velocity_mps[np.isfinite(velocity_mps).all(axis=1)]
+    sums = np.add.reduceat(
+        np.column_stack([known, np.hypot(*known.T)]), np.arange(0, len(known), 5 * MEAN_POINTS)
+    )
+    return bool(np.median(np.hypot(*sums.T[:2]) / np.maximum(sums[:, 2], 1e-9)) > GOES_ON)
 
 
 def _turn_speed(sources: Sequence[Seen], robot: Described) -> Array:
     """Return the speed (n,) that the ends of the robot have by its turning alone; 0 where no turn is seen."""
     rates = [
-        each.yaw_rate_radps for each in sources if each.yaw_rate_radps is not None and each.power is None
+        each.yaw_rate_radps for each in sources if each.yaw_rate_radps is not None and each.name != SIDES
     ]
     if not rates:
         return np.zeros(1)
@@ -440,28 +522,36 @@ def _turn_speed(sources: Sequence[Seen], robot: Described) -> Array:
 
 def _yaw_rates(sources: Sequence[Seen], robot: Described) -> list[Finding]:
     """Compare the yaw rates of sources, and the turns of courses, with the first: the gyro's where there is one."""
-    turning = [each for each in sources if each.yaw_rate_radps is not None]
-    reference = next((each for each in turning if each.power is None and each.name != WHEELS), None)
+    turning = [each for each in sources if each.yaw_rate_radps is not None and each.name != SIDES]
+    reference = next((each for each in turning if each.name != WHEELS), None)
     if reference is None or reference.yaw_rate_radps is None:
         return []
     rate = reference.yaw_rate_radps
     judged: list[tuple[Seen, float, int]] = []
-    for seen in turning:
-        of_course = seen.power is not None
-        if seen is reference or (of_course and robot.sideways is not False):
+    for seen in sources:
+        if seen is reference or seen.name == SIDES:
             continue
-        assert seen.yaw_rate_radps is not None
-        weight, measured = np.ones_like(rate), seen.yaw_rate_radps
-        if seen.power is not None:
-            norm = max(float(np.nanmean(seen.power)) if np.isfinite(seen.power).any() else 0.0, 1e-12)
-            weight, measured = seen.power / norm, measured / norm
-        by = _compare(measured[:, None], (rate * weight)[:, None])
-        is_certain = by.is_known and (not of_course or by.n >= MIN_CERTAIN_POINTS)
-        larger = by.most if is_certain else 0.0
+        if seen.course_mps is not None:
+            judged += [(seen, sign, n) for sign, n in _turn_of_course(seen.course_mps, rate, sources, robot)]
+        if seen.yaw_rate_radps is None or _apart(seen.yaw_rate_radps, rate):
+            continue
+        by = _compare(seen.yaw_rate_radps[:, None], rate[:, None])
+        changes = _compare_changes(seen.yaw_rate_radps, rate)
+        if is_certain := changes.is_known and changes.least >= MIN_TURN_CHANGE_RADPS:
+            by = changes
+        larger = by.most if by.is_known else 0.0
         # a sign is that of two turns, not of a turn and what a robot that does not mean to turn shows, as wheels do
-        both = by.least >= MIN_TURN_RADPS / 2
-        if larger >= MIN_TURN_RADPS and (both or (by.cosine > 0.0 and seen.name != WHEELS)):
-            judged.append((seen, math.copysign(by.ratio, by.cosine), by.n))
+        both = is_certain or by.least >= MIN_TURN_RADPS / 2
+        if not (is_certain or larger >= MIN_TURN_RADPS) or not (
+            both or (by.cosine > 0.0 and seen.name != WHEELS)
+        ):
+            continue
+        pair = _shifted(seen.yaw_rate_radps, rate, by.shift)
+        slips = seen.name == WHEELS and by.cosine > 0.0 and by.ratio > IMPLAUSIBLE_RATIO
+        factor = _factor(*pair, MIN_TURN_CHANGE_RADPS)
+        if slips and (robot.sideways or not (factor.is_one and factor.varies)):
+            continue
+        judged.append((seen, math.copysign(by.ratio, by.cosine), by.n))
     contradict = [not 1.0 / IMPLAUSIBLE_RATIO <= factor <= IMPLAUSIBLE_RATIO for _, factor, _ in judged]
     signs = {math.copysign(1.0, factor) for _, factor, _ in judged}
     if len(judged) > 1 and all(contradict) and len(signs) == 1:  # all others contradict the first
@@ -471,8 +561,58 @@ def _yaw_rates(sources: Sequence[Seen], robot: Described) -> list[Finding]:
     return [_turned(seen, reference, factor, n) for seen, factor, n in judged]
 
 
+def _reversed_side(sources: Sequence[Seen]) -> list[Finding]:
+    """Return whether a robot that turns by its wheels does so as the sum of both sides, and not as their difference."""
+    rates = {each.name: each.yaw_rate_radps for each in sources if each.yaw_rate_radps is not None}
+    sides, wheels = (
+        rates.pop(SIDES, None),
+        next((each.velocity_mps for each in sources if each.name == WHEELS), None),
+    )
+    if sides is None or wheels is None or not rates:
+        return []
+    name, rate = next(iter(rates.items()))
+    by_sum, by_difference = (_compare_changes(each, rate) for each in (wheels[:, 0], sides))
+    alike = (
+        by_sum.is_known and by_sum.least >= MIN_TURN_CHANGE_RADPS and abs(by_sum.cosine) >= MIN_FAR_LIKENESS
+    )
+    if not alike or abs(by_difference.cosine) > 0.5:
+        return []
+    odd = f"turns: {name} shows turns as the sum of the speeds of both sides, not as their difference"
+    return [Finding("turns", 2, WHEELS, by_sum.cosine, f"{odd}: a turned sign of one side?")]
+
+
+def _turn_of_course(
+    course_mps: Array, rate_radps: Array, sources: Sequence[Seen], robot: Described
+) -> list[tuple[float, int]]:
+    """Return 1 where a course turns as a yaw rate says, -1 where it is its mirror image, with the number of points."""
+    wheels = next((each.velocity_mps for each in sources if each.name == WHEELS), None)
+    course = course_mps @ [1.0, 1.0j]
+    if robot.sideways:
+        if wheels is None:
+            return []
+        ahead = wheels[:, :2] @ [1.0, 1.0j]
+    else:
+        ahead = np.abs(course) * (1.0 if wheels is None else np.sign(wheels[:, 0]))
+    yaw_rad = np.cumsum(np.nan_to_num(rate_radps)) * STEP_S
+    body = ahead * np.exp(1.0j * yaw_rad)
+    known = np.isfinite(course) & np.isfinite(body) & np.isfinite(rate_radps)
+    n, blocks = int(known.sum()), np.arange(0, len(course), COURSE_POINTS)
+    if n < MIN_CERTAIN_POINTS:
+        return []
+    p, g = np.where(known, body, 0.0), np.where(known, course, 0.0)
+    norm = math.sqrt(float((np.abs(p) ** 2).sum() * (np.abs(g) ** 2).sum())) or math.inf
+    turned, mirrored = (
+        float(np.abs(np.add.reduceat(each, blocks)).sum()) / norm for each in (np.conj(p) * g, p * g)
+    )
+    rest = max(1.0 - max(turned, mirrored), 0.0)
+    apart = max(MIN_OVER_ROTATION, MIN_SIGMAS * math.sqrt(2.0 * MEAN_POINTS * rest / n))
+    if max(turned, mirrored) < MIN_MIRROR or abs(mirrored - turned) < apart:
+        return []
+    return [(1.0 if turned > mirrored else -1.0, n)]
+
+
 def _turned(seen: Seen, reference: Seen, factor: float, n: int) -> Finding:
-    what = "turn of the course" if seen.power is not None else "yaw rate"
+    what = "turn of the course" if seen.course_mps is not None else "yaw rate"
     of = f"turns: the {what} of {seen.name} is {factor:.3g} times that of {reference.name}"
     low, high, bound = 1.0 / DOUBTFUL_TURN_RATIO, DOUBTFUL_TURN_RATIO, IMPLAUSIBLE_RATIO
     if WHEELS in (seen.name, reference.name):  # they slip, and the front of a car pushes on
@@ -480,11 +620,11 @@ def _turned(seen: Seen, reference: Seen, factor: float, n: int) -> Finding:
     why = mistake(factor, TURN_FACTORS)
     if factor < 0.0:
         why = "a turned sign, or axis?"
-        if seen.power is not None:
+        if seen.course_mps is not None:
             why = "x and y exchanged (x is east, y north), or a turned axis?"
         elif WHEELS in (seen.name, reference.name):
             why = "a turned sign of the steering or of the gyro, or wheels exchanged?"
-    elif low <= factor <= high or seen.power is not None:
+    elif low <= factor <= high or seen.course_mps is not None:
         return Finding("turns", 0, seen.name, factor, of)
     beyond = not 1.0 / bound <= factor <= bound
     if seen.name == WHEELS and factor > 1.0:
@@ -504,11 +644,13 @@ def _directions(sources: Sequence[Seen], robot: Described) -> list[Finding]:
             continue
         speed = np.hypot(*seen.velocity_mps.T)
         goes = (speed > MIN_SPEED_MPS) & (_turn_speed(sources, robot) < 0.5 * speed)
+        if wheels is not None:  # a robot that slips may slide anywhere
+            rolled = np.hypot(*wheels[:, :2].T)
+            goes &= ~((speed < rolled / DOUBTFUL_RATIO) | (speed > DOUBTFUL_RATIO * rolled))
         if goes.sum() < MIN_POINTS:
             continue
         v = np.where(goes[:, None], seen.velocity_mps, np.nan)
-        power = np.nansum(v**2, axis=0)
-        ahead = float(power[0] / power.sum())
+        ahead = float(np.nanmedian(v[:, 0] ** 2 / speed**2))
         of = f"direction: {100 * ahead:.0f} % of the motion of {seen.name} is along the robot's x axis"
         by = Likeness() if wheels is None else _compare(v[:, :columns], wheels[:, :columns])
         n = int(goes.sum())
@@ -527,24 +669,61 @@ def _directions(sources: Sequence[Seen], robot: Described) -> list[Finding]:
     return found
 
 
-def _course_of_receiver(sources: Sequence[Seen]) -> list[Finding]:
-    """Compare the directions of a receiver's velocity and of its positions, of one frame, where both are as fast."""
-    of = {seen.name: seen.velocity_mps for seen in sources if seen.velocity_mps is not None}
+def _clocks(sources: Sequence[Seen]) -> list[Finding]:
+    """Compare speeds, and yaw rates, with the first one at shifts of seconds: clocks that are apart, or a delay."""
+    rates = [(each.name, each.yaw_rate_radps) for each in sources if each.yaw_rate_radps is not None]
+    speeds = [
+        (each.name, np.linalg.norm(each.velocity_mps, axis=1))
+        for each in sources
+        if each.velocity_mps is not None
+    ]
+    found: dict[tuple[str, str], Finding] = {}
+    for signals in (rates, speeds):
+        for name, values in signals[1:]:
+            reference, first = signals[0]
+            if away_s := _apart(values, first):
+                odd = f"clocks: {name} and {reference} agree when shifted by {away_s:+.1f} s: clocks apart, or a delay?"
+                found.setdefault((name, reference), Finding("clocks", 1, name, away_s, odd))
+    return list(found.values())
+
+
+def _apart(measured: Array, reference: Array) -> float:
+    """Return by how much a signal (n,) is later; 0 where it is as much alike within :data:`SHIFTS_S`."""
+    near, far = (_compare_changes(measured, reference, shifts_s) for shifts_s in (SHIFTS_S, FAR_SHIFTS_S))
+    alike = far.n >= 2 * MIN_CERTAIN_POINTS and far.least >= MIN_TURN_RADPS / 2
+    if not alike or abs(far.cosine) < max(MIN_FAR_LIKENESS, abs(near.cosine) + MIN_FAR_GAIN):
+        return 0.0
+    return STEP_S * far.shift
+
+
+def _receivers_axes(sources: Sequence[Seen]) -> list[Finding]:
+    """Compare a receiver's velocity with the change of its positions, of one frame: direction and size."""
+    of = {seen.name: seen.course_mps for seen in sources if seen.course_mps is not None}
     velocity, moved = of.get("the velocity of gnss"), of.get("the position of gnss")
     if velocity is None or moved is None:
         return []
     speeds = np.hypot(*velocity.T), np.hypot(*moved.T)
     slow, fast = np.minimum(*speeds), np.maximum(*speeds)
-    goes = (slow > MIN_SPEED_MPS) & (fast < DOUBTFUL_RATIO * slow)
+    goes = (slow > MIN_SPEED_MPS) & (fast < IMPLAUSIBLE_RATIO * slow)
     if (n := int(goes.sum())) < MIN_POINTS:
         return []
     cosine = float(np.median((velocity * moved).sum(axis=1)[goes] / (slow * fast)[goes]))
     apart_deg = math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
     text = f"direction: the velocity of gnss is {apart_deg:.0f} degrees from its path"
-    if cosine >= 0.5:
-        return [Finding("direction", 0, "the velocity of gnss", cosine, text)]
-    why = "a course that is not from north, clockwise, or latitude and longitude exchanged?"
-    return [Finding("direction", _level(n, True, True), "the velocity of gnss", cosine, f"{text}: {why}")]
+    if cosine < 0.5:
+        why = "a course that is not from north, clockwise, or latitude and longitude exchanged?"
+        return [Finding("direction", _level(n, True, True), "the velocity of gnss", cosine, f"{text}: {why}")]
+    found = [Finding("direction", 0, "the velocity of gnss", cosine, text)]
+    for axis, v, m in zip("xy", velocity.T, moved.T, strict=True):
+        along = goes & (np.abs(v) > 0.5 * speeds[0])
+        if (n := int(along.sum())) < MIN_POINTS:
+            continue
+        least, ratio, most = np.quantile(m[along] / v[along], [0.1, 0.5, 0.9]).tolist()
+        if least > RECEIVER_RATIO or most < 1.0 / RECEIVER_RATIO:
+            odd = f"position: that of gnss changes {ratio:.3g} times as fast as its velocity along {axis}"
+            why = "degrees without the cosine of the latitude, a sign, or another unit?"
+            found.append(Finding("position", _level(n, True, False), "gnss", ratio, f"{odd}: {why}"))
+    return found
 
 
 def _still_positions(run: RunLog, sources: Sequence[Seen]) -> list[Finding]:
@@ -599,25 +778,30 @@ def _acceleration(sources: Sequence[Seen]) -> list[Finding]:
     seen = {each.name: each.acceleration_mps2 for each in sources if each.acceleration_mps2 is not None}
     if len(seen) < 2:
         return []
-    by = _compare_changes(seen[ACCELEROMETER], seen[WHEELS])
+    by, left = (_compare_changes(each, seen[WHEELS][:, 0]) for each in seen[ACCELEROMETER].T)
+    if abs(by.cosine) < 0.5 and left.is_known and left.least >= MIN_ACCELERATION_MPS2:
+        odd = (
+            "acceleration: accel_y, and not accel_x, is as the acceleration of the wheels: x and y exchanged?"
+        )
+        return [Finding("acceleration", 1, "imu", left.cosine, odd)]
     if not by.is_known or by.least < MIN_ACCELERATION_MPS2:
         return []
     of = f"acceleration: accel_x is {math.copysign(by.ratio, by.cosine):.3g} times the acceleration of the wheels"
     if by.cosine < 0.0:
         return [Finding("acceleration", 1, "imu", -by.ratio, f"{of}: a turned x axis of the IMU?")]
-    if by.ratio < LEAST_OF_WHEELS:
+    pair = _shifted(seen[ACCELEROMETER][:, 0], seen[WHEELS][:, 0], by.shift)
+    if _factor(*pair, MIN_ACCELERATION_MPS2).most < LEAST_OF_WHEELS:
         return [Finding("acceleration", 1, "imu", by.ratio, f"{of}: wheels in km/h or rad/s read as m/s?")]
     return [Finding("acceleration", 0, "imu", by.ratio, of)]
 
 
-def _compare_changes(measured: Array, reference: Array) -> Likeness:
+def _compare_changes(measured: Array, reference: Array, shifts_s: Array = SHIFTS_S) -> Likeness:
     """Compare two signals (n,) about their means: an offset, or a mounting askew, is no turned sign."""
     both = np.isfinite(measured) & np.isfinite(reference)
     if both.sum() < MIN_CERTAIN_POINTS:
         return Likeness()
-    return _compare(
-        *(np.where(both, each - each[both].mean(), np.nan)[:, None] for each in (measured, reference))
-    )
+    about = (np.where(both, each - each[both].mean(), np.nan)[:, None] for each in (measured, reference))
+    return _compare(*about, shifts_s)
 
 
 def _attitude(run: RunLog, grid_s: Array) -> list[Finding]:
@@ -670,7 +854,7 @@ def _tilt_rates(run: RunLog, grid_s: Array) -> list[Finding]:
             continue
         factor = math.copysign(by.ratio, by.cosine)
         of = f"tilt: the gyro about {about} shows {factor:.3g} times the change of tilt that gravity shows"
-        if factor < 0.0:
+        if factor < -1.0 / IMPLAUSIBLE_RATIO:  # less is that of turns, not of tilt
             found.append(
                 Finding("tilt", 2, names[0], factor, f"{of}: a turned axis of the gyro or accelerometer?")
             )
@@ -749,3 +933,31 @@ def _currents(run: RunLog, robot: Described) -> list[Finding]:
         return []
     level = 2 if largest > 30.0 * robot.current_max_a else int(largest > 3.0 * robot.current_max_a)
     return [Finding("current", level, "wheels", largest, of + (": in mA?" if level else ""))]
+
+
+def _efforts(run: RunLog, sources: Sequence[Seen], grid_s: Array) -> list[Finding]:
+    """Compare the power of motors with the force ahead that the accelerometer shows: uphill and speeding up they drive.
+
+    Currents without a sign say nothing.
+    """
+    wheels, seen = run.streams.get("wheels"), {each.name: each for each in sources}
+    names = [] if wheels is None else [name for name in wheels.channels if name.startswith("speed_")]
+    pairs = [(name, name.replace("speed_", "current_").replace("_mps", "_a")) for name in names]
+    if wheels is None or ACCELEROMETER not in seen or WHEELS not in seen:
+        return []
+    known = [(speed, current) for speed, current in pairs if current in wheels.channels]
+    force, velocity = seen[ACCELEROMETER].acceleration_mps2, seen[WHEELS].velocity_mps
+    if not known or force is None or velocity is None:
+        return []
+    power = sum(wheels.channel(speed) * wheels.channel(current) for speed, current in known)
+    power = _change(wheels.time_s, np.asarray(power), grid_s, of_rate=True)
+    drives = (force[:, 0] * np.sign(velocity[:, 0]) > MIN_FORCE_MPS2) & (
+        np.abs(velocity[:, 0]) > MIN_SPEED_MPS
+    )
+    braking = power[drives & np.isfinite(power)] < 0.0
+    signed = min(float(wheels.channel(current).min()) for _, current in known) < 0.0
+    if not signed or len(braking) < MIN_POINTS or np.mean(braking) < MOSTLY:
+        return []
+    of = f"current: motors brake at {100 * np.mean(braking):.0f} % of the points"
+    odd = f"{of} at which the robot climbs or speeds up: a turned sign?"
+    return [Finding("current", 1, "wheels", float(np.mean(braking)), odd)]

@@ -197,7 +197,7 @@ def judge(run: RunLog, robot: Described = UNKNOWN_ROBOT) -> tuple[Check, ...]:
         text = f"channels: 'wheels' lacks {', '.join(robot.lacking)}: motion and slip stay unknown"
         checks.append(Check("channels", DOUBTFUL, "wheels", float(len(robot.lacking)), text))
     motion = map(_check_of, motion_findings(known, robot))
-    return (*checks, *motion, *_values(run), *_constants(known), _overlap(run))
+    return (*checks, *motion, *_values(run, robot), *_constants(known), _overlap(run), *_pauses(run))
 
 
 def judge_together(runs: Sequence[tuple[RunLog, Described]]) -> tuple[Check, ...]:
@@ -272,6 +272,7 @@ MAX_OTHER_LIKENESS = 0.3  #: A regular to and fro is like both signs at some shi
 #: Yaw rate over that of wheels that do not slip.  Measured runs of four robots reach 0.12 (a Husky on snow) to 1.0;
 #: two of 200 dig in and hardly turn (0.03, 0.05), so that less is doubtful and no more.
 TURN_RATIO = (0.1, 1.5)
+MIN_STUCK_S = 10.0  #: A robot that digs in for seconds is none whose wheels are in another unit.
 #: Nothing turns a robot faster than its wheels by so much; degrees make it 20 to 60.
 MAX_IMPLAUSIBLE_TURN_RATIO = 8.0
 
@@ -300,6 +301,7 @@ def _turns(run: RunLog, robot: Described) -> Check:
     alike = f"(likeness {likeness:.2f} of 1)"
     if rate_radps < MIN_TURN_RADPS or abs(likeness) < MIN_LIKENESS or other > MAX_OTHER_LIKENESS:
         return _unknown(*about, f"yaw rate: gyro and wheels show no turns in common {alike}", likeness)
+    seconds = run.streams["wheels"].duration_s
     measured = f"yaw rate: the gyro shows {ratio:.3g} rad/s for each m/s between the sides"
     if described:
         measured = f"yaw rate: the gyro shows {ratio:.3g} times the yaw rate of the wheels {alike}"
@@ -308,7 +310,11 @@ def _turns(run: RunLog, robot: Described) -> Check:
     cases: list[Case] = [
         (likeness < 0.0, IMPLAUSIBLE, f"{odd}: turned sign of the gyro, or sides swapped"),
         (ratio > MAX_IMPLAUSIBLE_TURN_RATIO, IMPLAUSIBLE, f"{odd}: a gyro in deg/s read as rad/s?"),
-        (ratio < low, DOUBTFUL, f"{odd}: wheels that dig in, or in rad/s or km/h read as m/s?"),
+        (
+            ratio < low and seconds > MIN_STUCK_S,
+            DOUBTFUL,
+            f"{odd}: wheels that dig in, or in rad/s or km/h read as m/s?",
+        ),
         (ratio > high, DOUBTFUL, f"{odd}: another track?"),
     ]
     return _first(*about, ratio, *cases, (True, OK, measured))
@@ -438,13 +444,15 @@ def check_names(name: str, stream: Stream) -> list[Check]:
     return odd or [Check("channel names", OK, name, math.nan, sound)]
 
 
-def _values(run: RunLog) -> list[Check]:
+def _values(run: RunLog, robot: Described) -> list[Check]:
     checks = []
     for name, stream in run.streams.items():
         largest = np.nanmax(np.abs(stream.values), axis=0, initial=0.0)
         for channel, value in zip(stream.channels, largest.tolist(), strict=True):
             place = f"channel {channel!r} of stream {name!r}: reaches"
             most = DOUBTFUL_VALUES.get(channel.partition("_")[0], math.inf)
+            if channel.startswith("current_") and math.isfinite(robot.current_max_a):
+                most = math.inf  # that of its motors is compared
             much = value > most and signal_set_of(name, channel) is not None
             cases = (
                 (value > MAX_MAGNITUDE, IMPLAUSIBLE, f"{place} {value:.6g}; {BEYOND}"),
@@ -460,10 +468,13 @@ def _constants(run: RunLog) -> list[Check]:
     """Return channels that are constant while another one of their signals varies, or the wheels turn."""
     still: dict[tuple[str, str, str], bool] = {}
     for name, stream in run.streams.items():
-        if len(stream) < MIN_SAMPLES or stream.duration_s < MIN_CONSTANT_S:
+        if len(stream) < STUCK_IMU_SAMPLES:
             continue
         for channel, values in zip(stream.channels, stream.values.T, strict=True):
-            if (signals := signal_set_of(name, channel)) in ("imu", "wheels", "currents"):
+            signals = signal_set_of(name, channel)
+            if signals == "imu" or (
+                signals in ("wheels", "currents") and stream.duration_s >= MIN_CONSTANT_S
+            ):
                 finite = values[np.isfinite(values)]
                 still[name, channel, str(signals)] = not finite.size or not np.ptp(finite)
     varying = {(name, signals) for (name, _, signals), constant in still.items() if not constant}
@@ -482,6 +493,17 @@ def _constants(run: RunLog) -> list[Check]:
 
 def _overlap(run: RunLog) -> Check:
     streams = {name: stream for name, stream in run.streams.items() if name not in NO_FEATURES}
+    for name, other in run.streams.items():
+        if (
+            streams
+            and name in NO_FEATURES
+            and not any(
+                other.time_s[0] <= stream.time_s[-1] and stream.time_s[0] <= other.time_s[-1]
+                for stream in streams.values()
+            )
+        ):
+            text = f"overlap: stream {name!r} is at no time at which {', '.join(streams)} are: clocks apart?"
+            return Check("overlap", DOUBTFUL, name, 0.0, text)
     longest_s = max((stream.duration_s for stream in streams.values()), default=0.0)
     if len(streams) < 2:
         return _unknown("overlap", "all", "overlap: there is one stream of sensors")
@@ -496,6 +518,20 @@ def _overlap(run: RunLog) -> Check:
     odd = f"{expected}: other units of time, or loggers that were started apart?"
     odd_cases: list[Case] = [(ratio < implausible, IMPLAUSIBLE, odd), (ratio < doubtful, DOUBTFUL, odd)]
     return _first("overlap", "all", ratio, *odd_cases, (True, OK, measured))
+
+
+MAX_PAUSE_S = 300.0  #: A longer one in all sensors is between two runs.
+
+
+def _pauses(run: RunLog) -> list[Check]:
+    time_s = np.sort(np.concatenate([stream.time_s for stream in run.streams.values()] or [np.zeros(1)]))
+    longest_s = float(np.max(np.diff(time_s), initial=0.0))
+    if longest_s < MAX_PAUSE_S:
+        return []
+    text = (
+        f"sampling: no stream has a sample for {longest_s:.0f} s: two runs in one, or a clock that was set?"
+    )
+    return [Check("sampling", DOUBTFUL, "all", longest_s, text)]
 
 
 # -- Sentences on many runs -----------------------------------------------------------------------------------

@@ -96,22 +96,53 @@ def test_a_run_that_was_taken_as_it_is_is_stated_and_no_longer_refused(terrain, 
     assert (code, "an accelerometer in g" in " ".join(out.split())) == (0, True)
 
 
-def test_a_doubt_is_stated_on_the_screen_in_the_result_and_on_the_page(terrain, place, drive):
-    tilted = drive("r", "GRASS", 0, duration_s=8.0)
-    imu = tilted.streams["imu"]
+TILTED = "mostly along +z is expected: a tilted sensor, or a steep slope?"
+
+
+@pytest.fixture
+def tilted(place, drive):
+    """The folder to work in, with runs in ``data`` whose IMU is tilted."""
     turn = np.eye(6)
     turn[3:, 3:] = [[np.cos(0.6), 0, -np.sin(0.6)], [0, 1, 0], [np.sin(0.6), 0, np.cos(0.6)]]
-    imu = Stream(imu.time_s, imu.values @ turn.T, imu.channels)
-    write_run(replace(tilted, streams={**tilted.streams, "imu": imu}), place / "data")
-    found = ("--json", "found.json", "--report", "page.html")
-    code, out, _ = terrain("estimate", "--data", "data", "--filter", "slip", *found)
-    (doubt,) = json.loads((place / "found.json").read_text())["doubtful"]
-    assert code == 0
-    assert doubt.endswith("mostly along +z is expected: a tilted sensor, or a steep slope?")
-    assert "a tilted sensor, or a steep slope?" in " ".join(out.split())
-    assert "a tilted sensor, or a steep slope?" in (place / "page.html").read_text()
+    for seed in range(6):
+        terrain = ("GRASS", "GRAVEL")[seed % 2]
+        run = drive(f"{terrain}_{seed}", terrain, seed, duration_s=16.0)
+        imu = run.streams["imu"]
+        imu = Stream(imu.time_s, imu.values @ turn.T, imu.channels)
+        write_run(replace(run, streams={**run.streams, "imu": imu}), place / "data")
+    return place
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("convert", "data", "--out", "out"),
+        ("inspect", "data"),
+        ("estimate", "--data", "data", "--filter", "slip"),
+        ("calibrate", "--data", "data", *HUSKY),
+        ("crossval", "--data", "data"),
+        ("crossval", "--data", "data", "--cache", "cache"),
+        ("predict", "--data", "data", "--model", "model"),
+        ("label", "data", "--model", "model", "--proposals", "new.csv"),
+        ("serve", "--replay", "data", "--model", "model"),
+    ],
+    ids=lambda words: f"{words[0]} {words[-1]}",
+)
+def test_every_command_states_the_same_doubt_on_its_screen_and_in_its_result(
+    terrain, tilted, model_dir, words
+):
+    words = [str(model_dir) if word == "model" else word for word in words]
+    code, out, err = terrain(*words, "--json", "found.json", "--report", "page.html")
+    assert code == 0, err
+    assert TILTED in " ".join(out.split())
+    assert TILTED in (tilted / "page.html").read_text()
+    stated = str(json.loads((tilted / "found.json").read_text()))
+    assert stated.count(TILTED) >= 3
+
+
+def test_python_warns_of_a_doubt(tilted):
     with pytest.warns(DoubtfulRunWarning, match="a tilted sensor"):
-        face.load_runs(place / "data")
+        face.load_runs(tilted / "data")
 
 
 def test_samples_of_a_robot_that_is_served_are_judged_while_it_drives_and_nothing_is_refused():

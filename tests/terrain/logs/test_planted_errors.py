@@ -102,6 +102,28 @@ def rolling(run):
     return replace(run, streams={**run.streams, "imu": replace(old, values=values)})
 
 
+def later(seconds, *names):
+    """Return what adds to the time of some streams, or of the second half of all where none is named."""
+
+    def change(run):
+        streams = {}
+        for name, each in run.streams.items():
+            moved = each.time_s >= each.time_s[len(each) // 2] if not names else name in names
+            streams[name] = replace(each, time_s=each.time_s + seconds * moved)
+        return replace(run, streams=streams)
+
+    return change
+
+
+def both(*changes):
+    def change(run):
+        for each in changes:
+            run = each(run)
+        return run
+
+    return change
+
+
 def all_fixed(run):
     """Return a run whose receiver has an RTK fix, with the code of NMEA for it."""
     old = run.streams["gnss"]
@@ -110,6 +132,7 @@ def all_fixed(run):
 
 
 BAD, ODD = "implausible", "doubtful"
+WEST = scaled("gnss", -1.0, "position_x", "velocity_x")
 NORTH = ("position_x_m", "position_y_m"), ("velocity_x_mps", "velocity_y_mps")
 PLANTED = [
     # robot, what is done, how bad it is, what is stated of it
@@ -164,7 +187,12 @@ PLANTED = [
     ("agrimaro", scaled("steering", 1 / DEGREE, "angle"), BAD, "in degrees?"),
     ("agrimaro", scaled("steering", -1.0, "angle"), BAD, "a turned sign of the steering"),
     ("agrimaro", scaled("wheels", 0.1, "motor"), BAD, "before or after the reduction"),
-    ("agrimaro", scaled("wheels", 60 / (2 * np.pi), "motor"), ODD, "rpm?"),
+    (
+        "agrimaro",
+        scaled("wheels", 60 / (2 * np.pi), "motor"),
+        ODD,
+        "that of the wheels, 0.67 to 1.5 is expected",
+    ),
     ("agrimaro", scaled("odometry", 1e3, "velocity"), BAD, "mm?"),
     ("robotino", scaled("wheels", 1 / 16.0, "motor"), BAD, "before or after the reduction"),
     ("robotino", scaled("pose", 1e3, "position"), BAD, "mm?"),
@@ -174,10 +202,53 @@ PLANTED = [
     ("adap2e", scaled("steering", -1.0, "angle"), BAD, "a turned sign of the steering"),
     ("adap2e", scaled("imu", 1 / DEGREE, "gyro"), BAD, "degrees?"),
     ("adap2e", scaled("imu", -1.0, "gyro_z"), BAD, "a turned sign"),
-    ("adap2e", scaled("wheels", 3.6, "speed"), ODD, "speed: that of the wheels is 4.7"),
+    ("adap2e", scaled("wheels", 3.6, "speed"), ODD, "speed: that of the wheels is 4."),
     ("pallet_truck", exchanged("gnss", *NORTH), BAD, "x and y exchanged"),
+    ("adap2e", WEST, BAD, "the turn of the course of the velocity of gnss is -1 times that of the gyro"),
+    ("orchard_ugv", scaled("gnss", 1.556, "position_x"), ODD, "without the cosine of the latitude"),
+    ("adap2e", shifted("compass", "yaw_rad", np.pi / 2), BAD, "a yaw off by 90 degrees?"),
+    ("adap2e", shifted("compass", "yaw_rad", np.pi), BAD, "a yaw off by 180 degrees?"),
+    ("husky", scaled("wheels", -1.0, "speed_left"), BAD, "a turned sign of one side?"),
+    ("orchard_ugv", scaled("wheels", -1.0, "speed_right"), BAD, "a turned sign of one side?"),
+    ("husky", scaled("wheels", -1.0, "current"), ODD, "motors brake at 100 % of the points"),
+    ("adap2e", scaled("wheels", -1.0, "current"), ODD, "motors brake at"),
+    ("husky", scaled("wheels", 2.0, "speed"), ODD, "0.67 to 1.5 is expected: wheels that slip, or"),
+    ("adap2e", exchanged("imu", ("accel_x_mps2", "accel_y_mps2")), ODD, "x and y exchanged?"),
+    (
+        "husky",
+        later(4.0, "imu"),
+        ODD,
+        "the turn of the wheels and the gyro agree when shifted by -4.0 s: clocks apart, or a delay?",
+    ),
+    ("adap2e", later(5.0, "gnss"), ODD, "s: clocks apart, or a delay?"),
+    ("orchard_ugv", later(3600.0, "pose"), ODD, "stream 'pose' is at no time at which"),
+    ("husky", later(3600.0), ODD, "no stream has a sample for 3600 s: two runs in one"),
     ("pallet_truck", scaled("odometry", 3.6, "speed"), BAD, "km/h?"),
 ]
+
+
+def test_turns_of_a_few_degrees_a_second_tell_a_turned_sign():
+    """A car that is hardly steered; the offset of a gyro is no turn."""
+    run = simulate_run(load_robot("adap2e"), "grass", "survey", 80001, 1, duration_s=60.0)
+    run = replace(run, streams={name: run.streams[name] for name in run.streams if name != "truth"})
+    assert float(run.streams["imu"].channel("gyro_z_radps").std()) < 0.05
+    biased = shifted("imu", "gyro_z_radps", 0.02)
+    for change, level in ((biased, set()), (both(biased, scaled("steering", -1.0, "angle")), {BAD})):
+        odd = [check for check in judged(change(run)) if check.level in (BAD, ODD)]
+        assert {str(check.level) for check in odd} == level, odd
+
+
+def test_a_robot_that_spins_its_wheels_slides_or_digs_in_is_not_doubted():
+    """Slip is not one factor at every moment, and a robot that slides has no axis ahead."""
+    for robot, terrain, scenario in (
+        ("omnirobot", "grass", "survey"),
+        ("robotino", "clay", "complex"),
+        ("pallet_truck", "tilled_loam", "survey"),
+        ("robotino", "firm_soil_gravel", "spot_turn"),
+    ):
+        run = simulate_run(load_robot(robot), terrain, scenario, 80000, 1, duration_s=40.0, vary=True)
+        run = replace(run, streams={name: run.streams[name] for name in run.streams if name != "truth"})
+        assert [check for check in judged(run) if check.level in (BAD, ODD)] == []
 
 
 def test_a_sound_run_over_slopes_has_no_doubt():
@@ -235,7 +306,7 @@ def test_runs_of_seconds_show_together_what_none_of_them_shows(plant):
             {"track_m": 2.8},
             "another track?",
         ),  # its effective track is less than half of the described
-        ("robotino", {"wheel_radius_m": 0.02}, "speed: that of pose is 2"),
+        ("robotino", {"wheel_radius_m": 0.02}, "speed: that of pose is 1.99"),
         ("adap2e", {"wheelbase_m": 0.3}, "turns: the yaw rate of the wheels is "),
     ],
 )
