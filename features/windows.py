@@ -74,7 +74,7 @@ def lost_times(before_s: float, after_s: float, period_s: float, most: int) -> l
 def with_lost(time_s: Array, values: Array, period_s: float, most: int) -> tuple[Array, Array]:
     """Return samples with rows of NaN for those that were lost one by one, or few in a row."""
     gaps = np.flatnonzero(np.diff(time_s) > MAX_GAP_PERIODS * period_s)
-    lost = [lost_times(*time_s[i : i + 2].tolist(), period_s, most) for i in gaps]
+    lost = [lost_times(float(time_s[i]), float(time_s[i + 1]), period_s, most) for i in gaps]
     at = np.repeat(gaps + 1, [len(each) for each in lost])
     if not len(at):
         return time_s, values

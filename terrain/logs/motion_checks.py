@@ -443,8 +443,7 @@ def _speeds(sources: Sequence[Seen], robot: Described) -> list[Finding]:
         goes = _turn_speed(sources, robot) < 0.5 * slow
         pair = [np.where(goes, each, np.nan) for each in (values, speed[middle])]
         by = _compare(pair[0][:, None], pair[1][:, None], about_mean=True)
-        a, b = _shifted(*pair, by.shift)
-        factor = _factor(a, b, MIN_SPEED_MPS)
+        factor = _factor(*_shifted(pair[0], pair[1], by.shift), MIN_SPEED_MPS)
         n, ratio = factor.n, factor.ratio
         if n < MIN_POINTS or not 0.0 < ratio < math.inf:
             continue
@@ -548,8 +547,8 @@ def _yaw_rates(sources: Sequence[Seen], robot: Described) -> list[Finding]:
             continue
         pair = _shifted(seen.yaw_rate_radps, rate, by.shift)
         slips = seen.name == WHEELS and by.cosine > 0.0 and by.ratio > IMPLAUSIBLE_RATIO
-        factor = _factor(*pair, MIN_TURN_CHANGE_RADPS)
-        if slips and (robot.sideways or not (factor.is_one and factor.varies)):
+        slipped = _factor(*pair, MIN_TURN_CHANGE_RADPS)
+        if slips and (robot.sideways or not (slipped.is_one and slipped.varies)):
             continue
         judged.append((seen, math.copysign(by.ratio, by.cosine), by.n))
     contradict = [not 1.0 / IMPLAUSIBLE_RATIO <= factor <= IMPLAUSIBLE_RATIO for _, factor, _ in judged]
@@ -800,8 +799,8 @@ def _compare_changes(measured: Array, reference: Array, shifts_s: Array = SHIFTS
     both = np.isfinite(measured) & np.isfinite(reference)
     if both.sum() < MIN_CERTAIN_POINTS:
         return Likeness()
-    about = (np.where(both, each - each[both].mean(), np.nan)[:, None] for each in (measured, reference))
-    return _compare(*about, shifts_s)
+    m, r = (np.where(both, each - each[both].mean(), np.nan)[:, None] for each in (measured, reference))
+    return _compare(m, r, shifts_s)
 
 
 def _attitude(run: RunLog, grid_s: Array) -> list[Finding]:
