@@ -76,8 +76,6 @@ METRICS = {
     "sinkage_m": ("sinkage of the deepest wheel", "m"),
     "command_mps2": ("change of the wheels' commands, rms", "m/s²"),
     "yaw_drift_rad": ("change of heading over the drive", "rad"),
-    "turn_error_ratio": ("error of the yaw rate in steady turns", ""),
-    "turn_limit_ratio": ("of their time, at the limit of ground or motors", ""),
 }
 #: Of a start.
 OF_STARTS = "slip_peak", f"distance_{START_TIME_S:g}s_m", f"energy_{START_DISTANCE_M:g}m_j"
@@ -85,9 +83,12 @@ OF_STARTS = "slip_peak", f"distance_{START_TIME_S:g}s_m", f"energy_{START_DISTAN
 LABELS = METRICS | {
     "stop_m": ("stopping distance", "m"),
     "steepest_deg": ("steepest grade climbed", "°"),
+    "turn_error_ratio": ("error of the yaw rate in steady turns", ""),
+    "turn_limit_ratio": ("of their time, at the limit of ground or motors", ""),
     OF_STARTS[1]: (f"distance within {START_TIME_S:g} s of a start", "m"),
     OF_STARTS[2]: (f"energy of the first {START_DISTANCE_M:g} m", "J"),
 }
+TURNING = "arc", "circle", "spot_turn", "complex", "survey"  #: Scenarios with steady turns.
 TURNS = "turn_error_ratio", "turn_limit_ratio"  #: Of steady turns.
 #: Metrics of a controller that uses the terrain.
 BELIEF = ("believed_ratio", "n_accepted", "n_below_threshold", "n_refused")
@@ -322,7 +323,6 @@ def evaluate_drive(
         "sinkage_m": float(history.sinkage_m.mean()),
         "command_mps2": command_change(run.streams["commands"]) * robot.wheel_radius_m,
         "yaw_drift_rad": float(abs(history.yaw_rad[-1] - history.yaw_rad[0])),
-        **dict(zip(TURNS, turn_figures(run, history, robot, scenario), strict=True)),
     } | dict.fromkeys(BELIEF, math.nan)
     if adapting_to is not None:
         known = control.channel("terrain_code")[control.channel("desired_mps") >= DRIVING_MPS] >= 0.0
@@ -352,6 +352,8 @@ def evaluate_drive(
             of_starts.append(dict(zip(OF_STARTS, values, strict=True)))
         row |= {f"first_{key}": value for key, value in of_starts[0].items()}
         row |= {key: float(np.mean([each[key] for each in of_starts[1:]])) for key in OF_STARTS}
+    if scenario.name in TURNING:
+        row |= zip(TURNS, turn_figures(run, history, robot, scenario), strict=True)
     if scenario.name == BRAKE:
         stop_s = brake_time(scenario)
         row["stop_m"] = stopping_distance(history, stop_s)
@@ -430,15 +432,14 @@ REFERENCES = ("true_terrain", "classified", "fallback")
 #: Below this ratio of the driving time with a known terrain, nine tenths of a drive are the fallback's.
 HARDLY_BELIEVED_RATIO = 0.1
 _GENERAL = ("slip_peak", "energy_j_per_m", "distance_m", "final_speed_mps")
-_TURNING = (*TURNS, *_GENERAL)
 #: Metrics that a scenario is about, the most informative first.
 _OF_SCENARIO = {
+    **dict.fromkeys(TURNING, (*TURNS, *_GENERAL)),
     "starts": ("slip_peak", "energy_j_per_m", "distance_5s_m", "energy_4m_j", "final_speed_mps"),
     "brake": ("stop_m", "lock_s", "slip_peak", "energy_j_per_m"),
     "slope": ("steepest_deg", *_GENERAL),
-    "circle": ("scrub_j", *_GENERAL),
+    "circle": ("scrub_j", *TURNS, *_GENERAL),
     "crab": ("scrub_j", *_GENERAL),
-    **dict.fromkeys(("arc", "spot_turn", "complex", "survey"), _TURNING),
     "course": (*_GENERAL, "adapt_s", "adapted_ratio"),
     "mixed": (*_GENERAL, "adapt_s", "adapted_ratio"),
 }

@@ -333,6 +333,8 @@ class Actuation:
 
 # Order in which sensors are named, by health: one that steps or freezes takes others with it, which are lost.
 _NAMED_FIRST = (0, 1, 2, 3, 4, 6, 7, 5)
+#: The turn is corrected again once all sensors have been sound for this time: one that is noisy comes and goes.
+TRUSTED_S = 0.5
 FRESH_S = 0.5  #: Age of a measured speed over ground up to which a robot counts as slow.
 POSE_STATES = ("position_x_m", "position_y_m", "yaw_rad")  #: Of a filter that path tracking is built on.
 _NOT_TRACKED = TrackReport(math.nan, math.nan, 0.0, TrackStatus.NO_POSE)
@@ -411,6 +413,7 @@ class RobotControl:
         self.target_ratio, self._tilt_rad, self._tracking = math.nan, (0.0, 0.0), TrackState()
         self._state, self._pids, self._turn = TractionState(), [WheelPid()] * n, first_state(robot)
         self._wheel_radps, self._driven_mps, self._driven_part = np.zeros(n), 0.0, 1.0
+        self._sound_s = math.inf  # for how long all sensors have been
 
     def use(self, table: SlipTable) -> None:
         """Aim for the targets of a table from now on."""
@@ -487,7 +490,9 @@ class RobotControl:
         sensor, health = self._judge(seen)
         target = self._target(belief.terrain, seen, step_s)
         twist, tracked = self._track(desired, seen, time_s, dt_s)
-        twist = self._keep_turn(twist, seen, sound=health <= SOUND, dt_s=dt_s)
+        sound = health <= SOUND
+        self._sound_s = self._sound_s + step_s if sound else 0.0
+        twist = self._keep_turn(twist, seen, sound=self._sound_s >= TRUSTED_S, dt_s=dt_s)
         admitted, all_radps = self._to_wheels(twist, step_s)
         wheel_radps = all_radps[self._driven]
         desired_mps = max(map(abs, wheel_radps.tolist())) * self._radius_m
@@ -502,7 +507,6 @@ class RobotControl:
             observed = observe_wheels(self._robot, steer_rad, seen, time_s, ratio)
         else:
             observed = observed._replace(stale_s=math.nan)
-        sound = health <= SOUND
         seen_wheels = observed if sound else unobserved(len(wheel_radps))
         command_radps, done = self._command(
             wheel_radps, desired_mps, seen_wheels, target, belief.terrain, dt_s

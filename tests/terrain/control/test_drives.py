@@ -11,6 +11,7 @@ from terrain.control.slip_table import load_slip_table
 from terrain.control.switching import OutputStatus, TerrainBelief
 from terrain.control.turning import SETTINGS as TURN
 from terrain.errors import ConfigError
+from terrain.estimation.health import Health
 from terrain.estimation.live import LiveEstimate
 from terrain.records import Reading
 from terrain.robots import SkidSteerRobot, load_robot
@@ -243,6 +244,23 @@ def test_the_commanded_turn_is_kept_while_a_side_slips_more(name, twist):
     most = max(0.05 * abs(twist[2]), 0.01)
     assert np.abs(kept[late, 2] - twist[2]).max() < most
     assert abs(plain[-1, 2] - twist[2]) > 1.4 * abs(kept[-1, 2] - twist[2])
+
+
+@turning_by_wheels
+def test_a_sensor_that_comes_and_goes_turns_no_robot(name, monkeypatch):
+    pilot, turned = control(ROBOTS[name]), []
+    seen = RollingRobot(ROBOTS[name]).estimate()._replace(yaw_rate_radps=0.2)
+    for k in range(150):
+        lost = (k < 50 and k % 15 == 0) or k == 100
+        monkeypatch.setattr(
+            pilot, "_judge", lambda _, lost=lost: (0, Health.LOST) if lost else (-1, Health.FRESH)
+        )
+        now = DT_S * k, DT_S, np.array([0.5, 0.0, 0.0]), seen, BELIEF, OutputStatus.NONE
+        turned.append(bool(pilot.step(*now)[0].twist[2]))
+    assert not any(turned[:70])
+    assert all(turned[71:100])
+    assert not any(turned[100:124])
+    assert all(turned[126:])
 
 
 @turning_by_wheels
