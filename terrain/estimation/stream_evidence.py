@@ -96,7 +96,7 @@ class _Seen:
         self.value, self.shown = np.empty(0), np.zeros(2)
         self.came_s, self.jumped_s, self.period_s, self.apart = math.nan, math.nan, 0.0, 0.0
         self.scatter = self.usual = SCATTER_MPS
-        self.jumped, self.n_after, self.limit = np.zeros(1), 0, math.inf  # by which it was one
+        self.jumped, self.n_after, self.limit = np.zeros(1), 0, math.inf  # of one at rest
         self.jump, self.jump_per_s = math.inf, 0.0  # how far it may jump at once, and a second
         if sensor.name in _SPEEDS:
             self.jump = SPEED_JUMP_MPS
@@ -283,14 +283,15 @@ class StreamEvidence:
             seen.jumped, seen.apart = np.zeros(1), 0.0
         elif 0.0 < passed_s < FOLLOWING * max(seen.period_s, 0.05) and n_same < N_REPEATED:
             change, by = row - before, shown - seen.shown
-            limit = seen.jump + seen.jump_per_s * passed_s
+            limit, rests = seen.jump + seen.jump_per_s * passed_s, False
             if is_speed:
                 by_accel, by_wheels = (change[-1] - by).tolist()
                 known = [one for one in (by_accel, by_wheels) if math.isfinite(one)]
                 change = np.array([min(known, key=abs) if known else change[-1]])
                 if not known:  # what a robot can do
                     limit += SIGNALS["camera_speed_x_mps"].jump_per_s * passed_s
-                limit = max(limit, JUMPS * (REST_SCATTER_MPS if self._rested_s > RESTS_S else seen.scatter))
+                rests = self._rested_s > RESTS_S
+                limit = max(limit, JUMPS * (REST_SCATTER_MPS if rests else seen.scatter))
                 gap = min(max(by_accel, -limit), limit) if math.isfinite(by_accel) else 0.0
                 seen.apart = seen.apart * math.exp(-passed_s / COMPARED_S) + gap
                 if moves:  # at rest nothing shakes
@@ -299,8 +300,8 @@ class StreamEvidence:
             elif seen.is_reference:
                 change = change[:2]
                 limit += float(by[0]) + JUMP_STD * math.hypot(*np.nan_to_num([*before[2:], *row[2:]]))
-            _sum_jumps(seen, stamp_s, change, limit)
-            if is_speed and self._rested_s > RESTS_S and abs(row[-1]) <= NONE_MPS:  # as it should be at rest
+            _sum_jumps(seen, stamp_s, change, limit, rests)
+            if rests and abs(row[-1]) <= NONE_MPS:  # as it should be
                 seen.jumped = np.zeros(1)
         if passed_s > 0.0:
             seen.period_s += (min(passed_s, 1.0) - seen.period_s) * (0.1 if seen.period_s else 1.0)
@@ -335,7 +336,7 @@ class StreamEvidence:
         return Evidence(*ages_s, is_frozen, has_jumped, disagrees)
 
 
-def _sum_jumps(seen: _Seen, stamp_s: float, change: Array, limit: float) -> None:
+def _sum_jumps(seen: _Seen, stamp_s: float, change: Array, limit: float, rests: bool) -> None:
     """Sum up the jumps of a sensor, until it has jumped back or is believed.
 
     One that jumps on and on is no sensor that jumped: what it is compared with is wrong.
@@ -344,7 +345,7 @@ def _sum_jumps(seen: _Seen, stamp_s: float, change: Array, limit: float) -> None
     if math.hypot(*change.tolist()) > limit:
         goes_on = seen.jumped.any() and seen.n_after == 1 and float(change @ seen.jumped) > 0.0
         seen.jumped = np.zeros(1) if goes_on else seen.jumped + change
-        seen.jumped_s, seen.n_after, seen.limit = stamp_s, 0, limit
+        seen.jumped_s, seen.n_after, seen.limit = stamp_s, 0, limit if rests else math.inf
     if math.hypot(*seen.jumped.tolist()) <= min(limit, seen.limit) or stamp_s - seen.jumped_s > BELIEVED_S:
         seen.jumped = np.zeros(1)
 
