@@ -78,8 +78,11 @@ class Hub:
     """
 
     def __init__(self, settings: Settings) -> None:
-        if settings.model is None and settings.watch is None:
-            raise ConfigError("--model is missing: models:/NAME@champion, models:/NAME/3, or a model folder")
+        if settings.model is None and settings.watch is None and settings.robot is None:
+            raise ConfigError(
+                "--model is missing: models:/NAME@champion, models:/NAME/3, or a model folder (without one --robot is "
+                "given commands, and --watch compares)"
+            )
         self._watched = None if settings.watch is None else read_watched(settings.watch)
         self.settings, self._token = settings, required_token(settings)
         self._given = None if settings.robot is None else load_robot(settings.robot)

@@ -45,7 +45,7 @@ class ServedSettings(TrustSettings):
     """What is served."""
 
     model: str | None = setting(None)
-    """models:/NAME@champion, models:/NAME/3, or a folder; without one terrain is unknown (--can, --replay, --watch)."""
+    """models:/NAME@champion, models:/NAME/3, or a folder; without one terrain is unknown (--robot, --watch)."""
     table: Path | None = setting(None, "Table of target slips; the packaged one by default.")
     filter_stride_s: float | None = setting(None, option="--filter-stride")
     """Windows so far apart in s (0.25), filtered over time; as trained otherwise."""
@@ -209,6 +209,11 @@ class ServiceResult(Result):
         default=None,
     )
 
+    @property
+    def served_with(self) -> str:
+        """What robots are served with: a model, an extended robot, or commands alone."""
+        return self.model or self.watch or f"commands of {self.robot}"
+
 
 def run(settings: Settings, progress: Progress = silent) -> Result:
     """Serve until it is ended; with ``--check`` only find out whether it could."""
@@ -227,7 +232,7 @@ def run(settings: Settings, progress: Progress = silent) -> Result:
     if settings.check:
         service.close()
         return result
-    service.run(lambda url: print(f"serving {settings.model or settings.watch} at {url}", flush=True))
+    service.run(lambda url: print(f"serving {result.served_with} at {url}", flush=True))
     return replace(result, served=service.hub.metrics.totals())
 
 
@@ -239,15 +244,18 @@ def report(result: ServiceResult) -> Report:
         (f"{stream}, {result.rate_hz[stream]:g} Hz", enumerated(names))
         for stream, names in result.channels.items()
     ]
-    options = f"--model {result.model}" if result.model else f"--watch {result.watch}"
-    answer = f"{result.model} can be served: {enumerated(result.classes)}."
-    if not result.model:
-        answer = f"Robots can be compared with {result.watch}."
+    options = f"--watch {result.watch}" if result.watch else f"--robot {result.robot}"
+    answer = f"Robots can be compared with {result.watch}."
+    if result.model:
+        options, answer = (
+            f"--model {result.model}",
+            f"{result.model} can be served: {enumerated(result.classes)}.",
+        )
+    elif not result.watch:
+        answer = f"{result.robot} can be given commands; without a model its terrain is unknown."
     next_step = f"terrain serve {options}"
     if (done := result.served) is not None:
-        answer = (
-            f"{plural(done['sessions'], 'session')} of robots served with {result.model or result.watch}."
-        )
+        answer = f"{plural(done['sessions'], 'session')} of robots served with {result.served_with}."
         next_step = "terrain convert RECORDINGS --out RUNS"
         parts.insert(0, Pairs([(name.replace("_", " "), n) for name, n in done.items()]))
     details = sections(("Channels that the model needs", [Pairs(needs)] if needs else []))

@@ -93,6 +93,22 @@ def test_after_a_refused_start_the_port_is_free_and_no_thread_is_left(
     assert found.report.answer.endswith("can be served: a and b.")
 
 
+def test_without_a_model_a_robot_is_given_commands_and_an_observer_refused():
+    found = run(Settings(robot="husky", port=0, check=True)).report
+    assert found.answer == "husky can be given commands; without a model its terrain is unknown."
+    assert found.next_step == "terrain serve --robot husky"
+    channels = {"wheels": ["speed_left_mps", "speed_right_mps"], "imu": ["gyro_z_radps"]}
+    with running(robot="husky") as service, service.socket() as robot:
+        about = {"robot": "husky", "streams": channels}
+        assert "only a robot that asks for commands" in ask(robot, hello("seen", **about))["message"]
+        assert ask(robot, hello("driven", **about, control=True))["type"] == "welcome"
+        streams = {"wheels": [[0.0], [[0.0, 0.0]]], "imu": [[0.0], [[0.0]]]}
+        sent = {"type": "samples", "streams": streams, "twist": [0.5, 0.0, 0.0], "step": True, "time_s": 0.0}
+        step = ask(robot, sent)
+        assert (step["command"]["status"], step["observation"]["terrain"]) == ("ok", None)
+        assert step["command"]["twist"][0] > 0.0
+
+
 def test_damaged_states_of_robots_do_not_keep_the_service_from_starting(model_folder, tmp_path):
     damaged = {"bytes": b"\xff\x00", "half": b'{"version": 1', "deep": b"[" * 60_000}
     for name, content in damaged.items():
