@@ -12,7 +12,7 @@ from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from pipelines.data.settings import AlignedRunsSettings, RunsSettings, chosen_runs
 from terrain.errors import ConfigError, DoubtfulRunWarning, LogError, TerrainError
@@ -65,6 +65,7 @@ FOUND_BY: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 """What finds the runs of each layout, and patterns of its files: without one of these it is not even imported."""
 
+T = TypeVar("T")
 MOST_TOGETHER = 100  #: Short runs that are judged together: so many show what all do
 
 _log = logging.getLogger(__name__)
@@ -262,10 +263,20 @@ def verdicts_of(runs: Sequence[RunLog], robot: Robot | None = None) -> dict[str,
             sensors = frozenset((name, stream.channels) for name, stream in known.streams.items())
             alike[run.robot, sensors].append((known, described))
     for group in alike.values():
-        odd = judge_together(group[:: 1 + len(group) // MOST_TOGETHER])
+        odd = judge_together(some_of(group))
         for run, _ in group if odd else ():
             verdicts[run.run_id] += odd
     return verdicts
+
+
+def some_of(runs: Sequence[T]) -> Sequence[T]:
+    """Return at most :data:`MOST_TOGETHER` runs, spread over all."""
+    return runs[:: 1 + len(runs) // MOST_TOGETHER]
+
+
+def verdict_together(runs: Sequence[RunLog], robot: Robot | None = None) -> tuple[Check, ...]:
+    """Return what is odd about short runs of one robot with the same sensors, taken together."""
+    return judge_together([_described(run, robot) for run in runs])
 
 
 def verdict(run: RunLog, robot: Robot | None = None) -> tuple[Check, ...]:

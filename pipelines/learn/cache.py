@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ from features.extractor import FeatureExtractor
 from features.motion import window_motion
 from features.protocols import Samples
 from features.windows import Layout, WindowCut, WindowRule, cut_windows, labelled, layout_of, wheel_stream
-from pipelines.data.datasets import RunLoader, run_loaders, verdict
+from pipelines.data.datasets import RunLoader, run_loaders, some_of, verdict, verdict_together
 from pipelines.data.settings import AlignedRunsSettings, chosen_runs
 from pipelines.learn.parallel import parallel
 from pipelines.learn.recipes import recipe_of
@@ -36,6 +36,7 @@ from terrain.classify.limits import Motion
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.files.atomic import atomic_file, ensure_writable
 from terrain.logs.duplicates import RunPrint, possible_pairs, run_print, sentences, shared_stretches
+from terrain.logs.motion_checks import is_short
 from terrain.logs.plausibility import (
     Check,
     Doubt,
@@ -48,7 +49,7 @@ from terrain.logs.plausibility import (
 from terrain.logs.run_folders import data_digest, joint_digest
 from terrain.records import WINDOW_COLUMNS, Array, RunLog, Stream, Windows
 
-FORMAT_VERSION = 9
+FORMAT_VERSION = 10
 
 
 class RunHead(NamedTuple):
@@ -65,6 +66,7 @@ class RunHead(NamedTuple):
     fault: str = ""  #: why it was skipped; empty of one that was read
     doubts: Sequence[Sequence[Any]] = ()  #: fields of the checks that are doubtful or implausible
     session: str = ""
+    is_short: bool = False  #: too short to be judged by itself in what compares two sensors
 
     def sketch(self) -> RunLog:
         """Return a run of two samples a stream that has these channels and rates, and nothing else."""
@@ -122,10 +124,18 @@ def cached_data(
         for head in sorted(chosen, key=lambda head: head.run_id)
         for check in head.doubts
     ]
+    load_of = dict(zip([head.run_id or str(i) for i, head in enumerate(heads)], loaders, strict=True))
+    alike: defaultdict[Any, list[RunHead]] = defaultdict(list)
+    for head in chosen:
+        if head.is_short:
+            alike[head.robot, frozenset((name, tuple(names)) for name, names, _ in head.streams)].append(head)
+    for group in alike.values():
+        short = [load_of[head.run_id] for head in some_of(group)]
+        odd = verdict_together([load() for load in short], short[0].robot)
+        doubts += [Doubt(head.run_id, check) for head in group for check in odd]
     if not any(load.repair for load in loaders):
         refuse_implausible_runs(doubts, {head.run_id: head.repaired for head in chosen})
     used = {head.run_id for head in chosen}
-    load_of = dict(zip([head.run_id or str(i) for i, head in enumerate(heads)], loaders, strict=True))
     each = [(load_of[a], load_of[b]) for a, b in pairs if {a, b} <= used]
     compared = parallel(_compared, (), each, n_jobs, "compare runs", progress)
     if shared := [stretch for found in compared for stretch in found]:
@@ -206,6 +216,7 @@ def _head(place: Path, load: RunLoader) -> tuple[RunHead, Array, Array]:
         dict(run.dropped),
         session=run.session,
         doubts=[tuple(doubt.check) for doubt in doubts_of({run.run_id: checks})],
+        is_short=is_short(run),
     )
     if file is not None:
         _write(file, head._asdict(), code=prints.codes, time_s=prints.time_s)

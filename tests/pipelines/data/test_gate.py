@@ -140,6 +140,23 @@ def test_every_command_states_the_same_doubt_on_its_screen_and_in_its_result(
     assert stated.count(TILTED) >= 3
 
 
+def test_runs_of_seconds_are_refused_together_with_a_cache_as_without(terrain, place):
+    whole = simulate_run(load_robot("husky"), "grass", "complex", 0, 1, duration_s=40.0)
+    for k in range(6):
+        streams = {}
+        for name in ("imu", "wheels", "odometry"):
+            stream = whole.streams[name]
+            rows = (stream.time_s >= 6.0 * k) & (stream.time_s < 6.0 * (k + 1))
+            factor = 3.6 if name == "odometry" else 1.0
+            values = stream.values[rows] * factor
+            streams[name] = replace(stream, time_s=stream.time_s[rows], values=values)
+        write_run(replace(whole, run_id=f"piece_{k}", streams=streams), place / "data")
+    for words in ((), ("--cache", "cache"), ("--cache", "cache")):
+        code, out, err = terrain("crossval", "--data", "data", *words)
+        assert (code, out) == (2, "")
+        assert "piece_0: implausible over 6 runs, speed: that of odometry is 3." in err.splitlines()[-1]
+
+
 def test_python_warns_of_a_doubt(tilted):
     with pytest.warns(DoubtfulRunWarning, match="a tilted sensor"):
         face.load_runs(tilted / "data")
