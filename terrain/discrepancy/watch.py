@@ -4,7 +4,7 @@ Every :data:`BLOCK_S` the last samples are replayed by the extended model, measu
 as runs are by :mod:`terrain.discrepancy.runs`; a log is the same feed, looped.  A channel with residual ``r`` and
 prediction ``p`` has two figures a block: ``along = sum(r p) / |p|``, of a robot that turns or drives more or less than
 its model, and ``level = sum(r) / sqrt(n)``, of one that is off by an amount.  The gyro minus the yaw rate over ground
-is one more channel.  The file of the model states by how much it is off in quiet runs, which is taken off the figure, and
+is one more channel.  The file of the model states by how much it is off in quiet runs, which is taken off it, and
 the variance of the figure in them, ``noise + scatter e``, where ``e = sum(p^2)``, of the level the sum of the squared
 wheel speed.  ``z`` is the figure over its standard deviation, and over ``sqrt(memory)``: its long-run variance (Newey
 and West 1987), as blocks that follow each other are alike, or rather the upper limit of it with 95 %, of a new session
