@@ -52,7 +52,7 @@ SIGNED_MPS = 0.1  #: A robot that is slower may drive in either direction.
 #: Gyro against wheels: memories of what they are apart by, and of the wheels' turn, which the body follows later; of
 #: what is usual.  Further apart than the last number, than so many times its median, and than a part of the turn is a
 #: gyro or a side that measures something else: the median is 0.005 rad/s on smooth ground, and 0.03 on rough one.
-TURNS_S, FOLLOWS_S, USUAL_S, TURN_JUMPS, TURN_RATIO, TURN_RADPS = (0.1, 0.5), 0.5, 5.0, 7.0, 1.0, 0.06
+TURNS_S, FOLLOWS_S, USUAL_S, TURN_JUMPS, TURN_RATIO, TURN_RADPS = (0.1, 0.5), 0.5, 5.0, 7.0, 2.0, 0.06
 OUTLIER_RADPS = 0.25  #: One sample that is further apart moves a memory by no more than this would.
 _SPEEDS = ("camera_speed", "lidar_speed", "gnss_speed")
 _REFERENCES = ("odometry", "lidar", "pose", "gnss")

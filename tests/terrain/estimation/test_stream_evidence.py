@@ -248,12 +248,13 @@ def test_rough_ground_that_turns_the_robot_to_and_fro_is_no_fault_once_it_is_kno
     assert np.mean(named[500:]) < 0.01
 
 
-def test_a_robot_that_turns_later_than_its_wheels_and_by_less_is_no_fault():
+@pytest.mark.parametrize("part", [0.8, 0.35])
+def test_a_robot_that_turns_later_than_its_wheels_and_by_less_is_no_fault(part):
     turns, rng = Turns(), np.random.default_rng(0)
     turn = 0.0
     for k in range(600):
         wheels = 0.8 * (200 <= k < 400)
-        turn += (0.8 * wheels - turn) * DT_S / 0.3
+        turn += (part * wheels - turn) * DT_S / 0.3
         turns = turns.after(turn + 0.01 * rng.standard_normal(), wheels + 0.02 * rng.standard_normal(), DT_S)
         assert turns.apart_s == 0.0, k
 
