@@ -241,6 +241,7 @@ class FeedEvidence:
         late_s = [LATE_PERIODS / rates_hz[sensor.stream] for sensor in sensors]
         self._ages_s = list(zip(late_s, (sensor.lost_s for sensor in sensors), strict=True))
         self._names, self._tick_s = [sensor.name for sensor in sensors], 1.0 / described.wheels_rate_hz
+        self._signals = [_SIGNALS.get(name) for name in self._names]
         self._uses = places_among(self._names, model.sensor_names).tolist()
         self._motion, self._biases = (
             places_among(names, model.states).tolist() for names in (_MOTION, _BIASES)
@@ -272,28 +273,31 @@ class FeedEvidence:
         disagrees = {"accel": is_apart, "camera_speed": is_apart, "gyro": abs(bias[2]) > BIAS_RADPS}
         lines, channels = one["lines"], one["channels"]
         came_s, received_s = lines["came_s"].tolist(), one["received_s"].tolist()
-        jump_s = np.fmin(lines["jumping_s"], lines["jumped_s"]).tolist()
+        jumped = (time_s - np.fmin(lines["jumping_s"], lines["jumped_s"]) > JUMPING_S).tolist()
         repeats = (channels["repeated"] >= np.maximum(REPEATED, LONGER * channels["longest"])).tolist()
-        is_moving = bool((np.abs(one["wheel_once_mps"]) > MOVING_MPS).any())
+        is_moving = any(abs(speed) > MOVING_MPS for speed in one["wheel_once_mps"].tolist())
+        any_jumped, any_repeats = True in jumped, is_moving and True in repeats
+        rates_radps, row_radps = rates.tolist(), row[:3].tolist()
         sample = tuple(wheels.tolist())
         n_repeated = memory.n_repeated + 1 if sample == memory.wheels else 0
         is_fast = math.hypot(along, across) > AT_REST_MPS
         evidence, gated_s = [], list(memory.gated_s)
         for i, (name, (late_s, lost_s)) in enumerate(zip(self._names, self._ages_s, strict=True)):
-            taken_s, has_jumped, is_frozen = -math.inf, False, False
-            if name in _SIGNALS:
-                taken, first, last, own = _SIGNALS[name]
+            has_jumped, is_frozen = False, False
+            if (signals := self._signals[i]) is not None:
+                taken, first, last, own = signals
                 taken_s = came_s[taken]
-                has_jumped = any(time_s - jump_s[k] > JUMPING_S for k in range(first, last + 1))
-                is_frozen = is_moving and any(repeats[c] for c in own)
+                has_jumped = any_jumped and any(jumped[first : last + 1])
+                is_frozen = any_repeats and any(repeats[c] for c in own)
             else:
-                kind, wheel = divmod(i, 3)
-                taken_s = received_s[kind][wheel]
-                if kind == 0:  # zeros may be those of a robot at rest
-                    is_stuck = math.isnan(row[wheel]) and repeats[FIRST_WHEEL + wheel]
-                    is_frozen = (is_stuck and math.isfinite(rates[wheel])) or (
-                        n_repeated >= N_STUCK and bool(rates[wheel] != 0.0 or is_fast)
+                taken_s = received_s[i // 3][i % 3]
+                if i < 3:  # zeros may be those of a robot at rest
+                    is_stuck = (
+                        math.isnan(row_radps[i])
+                        and repeats[FIRST_WHEEL + i]
+                        and math.isfinite(rates_radps[i])
                     )
+                    is_frozen = is_stuck or (n_repeated >= N_STUCK and (rates_radps[i] != 0.0 or is_fast))
             used = use[self._uses[i]] if self._uses[i] >= 0 else ABSENT
             if used == GATED:
                 gated_s[i] += self._tick_s
