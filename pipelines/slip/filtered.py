@@ -104,7 +104,7 @@ def estimate_all(
 
 
 def _clocks_apart(runs: Sequence[RunLog], robot: Robot | None) -> tuple[str, ...]:
-    """Return a sentence where the turns of robots that skid show that the clocks of wheels and IMU are apart."""
+    """Return a sentence where the turns of robots that skid look as if the clocks of wheels and IMU were apart."""
     robots = {run.run_id: robot or robot_named(run.robot) for run in runs}
     skidding = [run for run in runs if robots[run.run_id].skids]
     apart = offsets_apart_s(skidding, lambda run: robots[run.run_id].track_m)
@@ -112,9 +112,9 @@ def _clocks_apart(runs: Sequence[RunLog], robot: Robot | None) -> tuple[str, ...
         return ()
     worst = max(apart, key=lambda run_id: abs(apart[run_id]))
     return (
-        f"the clocks of wheels and IMU are apart in {len(apart)} of {len(runs)} runs, by "
-        f"{apart[worst]:+.2f} s in {worst}: yaw rates and slip in turns of these are wrong; --align brings the "
-        "wheels onto the IMU's clock",
+        f"the clocks of wheels and IMU look apart in {len(apart)} of {len(runs)} runs, by {apart[worst]:+.2f} s in "
+        f"{worst}: if they are, and it is not slip that varies from turn to turn, yaw rates and slip in turns of these "
+        "are wrong; --align brings the wheels onto the IMU's clock",
     )
 
 

@@ -133,7 +133,9 @@ def test_loggers_that_are_apart_are_named_and_aligned_on_request(tmp_path):
     )
     late = RunLog("late", "husky", {"imu": gyro, "wheels": wheels}, (Label(0.0, 40.0, "ICE"),))
     (sentence,) = estimate_runs([late], filter="slip").result.clocks
-    assert "apart in 1 of 1 runs, by -0.4" in sentence
+    assert (
+        "look apart in 1 of 1 runs, by -0.4" in sentence
+    )  # slip that varies from turn to turn looks like it
     write_run(late, tmp_path)
     assert run(Settings(data=tmp_path, filter="slip", align=True), silent).clocks == ()
     loaded = load(AlignedRunsSettings(data=tmp_path, align=True))[0][0]
