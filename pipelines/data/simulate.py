@@ -200,9 +200,10 @@ def limits_of(run: RunLog, robot: Robot, with_effects: bool, stuck: list[str]) -
 
 def report(result: SimulatedRuns) -> Report:
     """Return how much was simulated."""
+    length = f" of {result.duration_s:.0f} s" if result.n_runs == 1 else f", {result.duration_s:.0f} s in all"
     return Report(
         f"Simulated runs of {result.robot}",
-        f"{plural(result.n_runs, 'run')}, {result.duration_s:.0f} s in all, written to {result.out}.",
+        f"{plural(result.n_runs, 'run')}{length}, written to {result.out}.",
         parts=[Text(sentence) for sentence in result.limits],
         next_step=f"terrain inspect {result.out}",
     )
