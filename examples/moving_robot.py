@@ -43,8 +43,8 @@ def drive(
     """
     robot = with_assumed(load_robot(robot_name))
     answers: list[dict[str, Any]] = []
-    asked = {"control": True, "rate_hz": 1.0 / PERIOD_S if real_time else 0.0}
-    with TerrainClient(url, f"{robot.name}-1", robot.name, sensor_channels(robot), **asked) as client:
+    channels, rate_hz = sensor_channels(robot), 1.0 / PERIOD_S if real_time else 0.0
+    with TerrainClient(url, f"{robot.name}-1", robot.name, channels, control=True, rate_hz=rate_hz) as client:
         begin_s = time.monotonic()
 
         def act(sample: Sample) -> Command:
