@@ -43,6 +43,7 @@ MIN_TURN_RADPS = 0.1
 MIN_LIKENESS = 0.8
 MAX_OTHER_LIKENESS = 0.3  #: A regular to and fro is like both signs at some shift: then none is certain
 DOUBTFUL_RATIO = 1.5
+SLIP_RATIO = 1.8  #: Of wheels over ground; a diameter for a radius is 2.
 DOUBTFUL_TURN_RATIO = 2.0  #: Scans that were matched in turns are off by more than positions.
 IMPLAUSIBLE_RATIO = 3.0
 #: A factor that is the same at nine of ten points within this, at speeds that differ by more, is one of units.
@@ -452,6 +453,8 @@ def _speeds(sources: Sequence[Seen], robot: Described) -> list[Finding]:
         slips = (middle == WHEELS and ratio < 1.0) or (name == WHEELS and ratio > 1.0)
         why = "wheels that slip, or " * slips + mistake(ratio, mistakes)
         low, high = 1.0 / DOUBTFUL_RATIO, DOUBTFUL_RATIO
+        if slips:  # by a third is usual
+            low, high = min(low, 1.0 / SLIP_RATIO), max(high, SLIP_RATIO)
         odd = f"{of}, {low:.2g} to {high:.2g} is expected: {why}"
         differs = factor.most < low or factor.least > high
         beyond = factor.most < 1.0 / IMPLAUSIBLE_RATIO or factor.least > IMPLAUSIBLE_RATIO

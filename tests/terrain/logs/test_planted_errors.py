@@ -191,7 +191,7 @@ PLANTED = [
         "agrimaro",
         scaled("wheels", 60 / (2 * np.pi), "motor"),
         ODD,
-        "that of the wheels, 0.67 to 1.5 is expected",
+        "that of the wheels, 0.56 to 1.8 is expected",
     ),
     ("agrimaro", scaled("odometry", 1e3, "velocity"), BAD, "mm?"),
     ("robotino", scaled("wheels", 1 / 16.0, "motor"), BAD, "before or after the reduction"),
@@ -212,7 +212,7 @@ PLANTED = [
     ("orchard_ugv", scaled("wheels", -1.0, "speed_right"), BAD, "a turned sign of one side?"),
     ("husky", scaled("wheels", -1.0, "current"), ODD, "motors brake at 100 % of the points"),
     ("adap2e", scaled("wheels", -1.0, "current"), ODD, "motors brake at"),
-    ("husky", scaled("wheels", 2.0, "speed"), ODD, "0.67 to 1.5 is expected: wheels that slip, or"),
+    ("husky", scaled("wheels", 2.0, "speed"), ODD, "0.56 to 1.8 is expected: wheels that slip, or"),
     ("adap2e", exchanged("imu", ("accel_x_mps2", "accel_y_mps2")), ODD, "x and y exchanged?"),
     (
         "husky",
