@@ -247,6 +247,8 @@ def _change(time_s: Array, values: Array, grid_s: Array, *, of_rate: bool) -> Ar
 def _angle_rate(time_s: Array, angle: Array, grid_s: Array) -> Array:
     """Return the rate of an angle, in its own unit; a jump by a turn of rad or of degrees is none."""
     known = np.isfinite(angle)
+    if not known.any():
+        return np.full(len(grid_s), np.nan)
     t, step = time_s[known], np.diff(angle[known])
     for turn in (2.0 * np.pi, 360.0):
         wrap = np.abs(np.abs(step) - turn) < 0.2 * turn
@@ -265,6 +267,8 @@ def _plane(stream: Stream, names: Sequence[str], grid_s: Array, *, of_rate: bool
 def _to_body(velocity_mps: Array, time_s: Array, yaw_rad: Array, grid_s: Array) -> Array:
     """Return velocities (n, 2) of a fixed frame along the axes of a body of this yaw."""
     known = np.isfinite(yaw_rad)
+    if not known.any():
+        return np.full_like(velocity_mps, np.nan)
     cos, sin = (np.interp(grid_s, time_s[known], each(yaw_rad[known])) for each in (np.cos, np.sin))
     x, y = velocity_mps.T
     return (

@@ -280,6 +280,15 @@ def test_wheels_that_spin_or_stand_are_never_refused(robot, terrain, scenario):
     assert BAD not in {check.level for check in judged(run)}
 
 
+@pytest.mark.parametrize("stream", ["compass", "gnss", "imu", "pose", "wheels"])
+def test_a_sensor_without_a_finite_value_is_no_error(stream):
+    old = sound("orchard_ugv").streams[stream]
+    dead = replace(old, values=np.full_like(old.values, np.nan))
+    run = sound("orchard_ugv")
+    checks = judged(replace(run, streams={**run.streams, stream: dead}))
+    assert BAD not in {check.level for check in checks}
+
+
 @pytest.mark.parametrize("plant", [scaled("odometry", 3.6, "speed"), scaled("odometry", -1.0, "speed")])
 def test_runs_of_seconds_show_together_what_none_of_them_shows(plant):
     """Pieces of 6 s of a run; sound ones have no doubt, of one alone nothing is certain."""
