@@ -9,7 +9,7 @@ what is expected, and of wheels that are faster than the ground where it is the 
 
 **Turns.**  Velocities of a course are those that speed and integrated yaw rate give, rotated by an unknown angle; with
 x and y exchanged they are their mirror image.  As complex numbers p and g, ``|sum(conj(p) g)|`` and ``|sum(p g)|`` over
-stretches of a minute, in which the gyro drifts little, tell one from the other.  No yaw angle is needed.
+stretches of up to a minute, in which the gyro drifts little, tell one from the other.  No yaw angle is needed.
 
 **Clocks.**  What is as alike as it can be only seconds apart was stamped by clocks that are apart, or came late.
 
@@ -54,7 +54,7 @@ LEAST_OF_WHEELS = 0.3
 MIN_TURN_CHANGE_RADPS = (
     0.01  #: Standard deviation of a yaw rate from which its changes tell a sign, whatever the bias
 )
-COURSE_POINTS = 300  #: A minute
+COURSE_POINTS = (150, 300)  #: Half a minute, of courses whose turns are many, and a minute
 #: A mirror explains at least so much of a course, and so much more of it than a rotation, and so many deviations.
 MIN_MIRROR, MIN_OVER_ROTATION, MIN_SIGMAS = 0.7, 0.01, 5.0
 MEAN_POINTS = round(1.0 / 0.2)  #: that share a mean of a second
@@ -602,19 +602,21 @@ def _turn_of_course(
     yaw_rad = np.cumsum(np.nan_to_num(rate_radps)) * STEP_S
     body = ahead * np.exp(1.0j * yaw_rad)
     known = np.isfinite(course) & np.isfinite(body) & np.isfinite(rate_radps)
-    n, blocks = int(known.sum()), np.arange(0, len(course), COURSE_POINTS)
+    n = int(known.sum())
     if n < MIN_CERTAIN_POINTS:
         return []
     p, g = np.where(known, body, 0.0), np.where(known, course, 0.0)
     norm = math.sqrt(float((np.abs(p) ** 2).sum() * (np.abs(g) ** 2).sum())) or math.inf
-    turned, mirrored = (
-        float(np.abs(np.add.reduceat(each, blocks)).sum()) / norm for each in (np.conj(p) * g, p * g)
-    )
-    rest = max(1.0 - max(turned, mirrored), 0.0)
-    apart = max(MIN_OVER_ROTATION, MIN_SIGMAS * math.sqrt(2.0 * MEAN_POINTS * rest / n))
-    if max(turned, mirrored) < MIN_MIRROR or abs(mirrored - turned) < apart:
-        return []
-    return [(1.0 if turned > mirrored else -1.0, n)]
+    for points in COURSE_POINTS:
+        blocks = np.arange(0, len(course), points)
+        turned, mirrored = (
+            float(np.abs(np.add.reduceat(each, blocks)).sum()) / norm for each in (np.conj(p) * g, p * g)
+        )
+        rest = max(1.0 - max(turned, mirrored), 0.0)
+        apart = max(MIN_OVER_ROTATION, MIN_SIGMAS * math.sqrt(2.0 * MEAN_POINTS * rest / n))
+        if max(turned, mirrored) >= MIN_MIRROR and abs(mirrored - turned) >= apart:
+            return [(1.0 if turned > mirrored else -1.0, n)]
+    return []
 
 
 def _turned(seen: Seen, reference: Seen, factor: float, n: int) -> Finding:
