@@ -108,7 +108,7 @@ def errors_of(run: RunLog, robot: Robot, between_s: tuple[float, float]) -> tupl
     for k, (name, wheel) in enumerate(zip(slip.channels, slip.wheels, strict=True)):
         if name not in truth.channels:  # a wheel that never turned
             continue
-        true = np.clip(np.interp(at_s, truth.time_s, truth.channel(name)), -1.0, 1.0)  # as slip_ratio is
+        true = np.clip(found.true(name), -1.0, 1.0)  # as slip_ratio is
         turns = np.interp(at_s, truth.time_s, truth.channel(f"wheel_{wheel}_radps")) * robot.wheel_radius_m
         chosen = (np.abs(turns) > LEAST_MPS) & (slip.time_s > between_s[0]) & (slip.time_s < between_s[1])
         errors.append((slip.mean[:, k] - true)[chosen])
