@@ -133,7 +133,8 @@ class Turns(NamedTuple):
         behind = self.wheels_radps + late * (wheels_radps - self.wheels_radps)
         beyond, known_s = np.abs(memories - self.usual_radps), self.known_s + dt_s
         scatter = self.scatter_radps * np.exp(slow * np.sign(beyond - self.scatter_radps))
-        turning = abs(wheels_radps - behind) + TURN_RATIO * min(abs(wheels_radps), abs(gyro_radps))
+        both = min(abs(wheels_radps), abs(gyro_radps)) if wheels_radps * gyro_radps > 0.0 else 0.0
+        turning = abs(wheels_radps - behind) + TURN_RATIO * both
         limit = np.maximum(TURN_JUMPS * self.scatter_radps, TURN_RADPS) + turning
         if (beyond > limit).any() or (self.apart_s and beyond[0] > 0.5 * limit[0]):
             return Turns(memories, scatter, self.usual_radps, behind, known_s, self.apart_s + dt_s)
