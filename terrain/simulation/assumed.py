@@ -10,7 +10,7 @@ With the mass m, the wheel radius r, the wheelbase L, n wheels that a motor turn
     motors         a torque of m g r / n, which slips every wheel, times 1 + L / B with the track B of robots that skid,
                    which have to turn, too; the top speed of a Froude number v^2 / (g L) of 0.25,
                    that of a brisk walk; 3000 turns a minute there, at 5/6 of no load: k_t = V / w_0, with 24 V, from
-                   100 kg on 48 V; a speed loop of 100 rad/s on a wheel that spins freely, integrating over 0.2 s, which
+                   100 kg on 48 V, and 400 V where that took over 500 A; a speed loop of 100 rad/s on a wheel that spins freely, integrating over 0.2 s, which
                    damps the robot by 0.7 to 1 of the critical damping, the described ones by 0.7 to 1.2
     steering       2 rad/s, of a car-like robot as it is described
     sensors        those of a common MEMS unit and of encoders on the motors
@@ -34,6 +34,7 @@ from terrain.simulation.contacts import TRACK_PATCHES, contacts_of
 # That a simulation needs; a camera is on board or is not.
 SECTIONS = ("body", "motors", "steering", "sensors")
 SAG_RATIO, DAMPING_RATIO, FROUDE = 0.025, 0.15, 0.25
+MOST_A = 500.0
 ROTOR_SHARE, MOTOR_RADPS, NO_LOAD_RATIO, HEAVY_KG = 0.2, 314.0, 1.2, 100.0
 FREE_RADPS, INTEGRAL_S = 100.0, 0.2
 # Friction of motors and reductions over the largest torque, and noise of a current over the largest.
@@ -127,6 +128,8 @@ def _motors(robot: Robot) -> dict[str, float]:
     speed_mps = math.sqrt(FROUDE * GRAVITY_MPS2 * robot.wheelbase_m)
     speed_radps = getattr(robot, "speed_max_mps", speed_mps) / radius_m
     supply_v = 24.0 if robot.mass_kg < HEAVY_KG else 48.0
+    if torque_nm * speed_radps > MOST_A * supply_v:
+        supply_v = 400.0
     gain = FREE_RADPS * robot.body.wheel_inertia_kgm2
     # a log of rates of motors has those of the wheels where the description has no reduction
     ratio = MOTOR_RADPS / speed_radps
