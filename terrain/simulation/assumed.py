@@ -10,8 +10,9 @@ With the mass m, the wheel radius r, the wheelbase L, n wheels that a motor turn
     motors         a torque of m g r / n, which slips every wheel, times 1 + L / B with the track B of robots that skid,
                    which have to turn, too; the top speed of a Froude number v^2 / (g L) of 0.25,
                    that of a brisk walk; 3000 turns a minute there, at 5/6 of no load: k_t = V / w_0, with 24 V, from
-                   100 kg on 48 V, and 400 V where that took over 500 A; a speed loop of 100 rad/s on a wheel that spins freely, integrating over 0.2 s, which
-                   damps the robot by 0.7 to 1 of the critical damping, the described ones by 0.7 to 1.2
+                   100 kg on 48 V, and 400 V where that took over 500 A; a speed loop of 100 rad/s on a wheel that
+                   spins freely, integrating over 0.2 s, which damps the robot by 0.7 to 1 of the critical damping, the
+                   described ones by 0.7 to 1.2
     steering       2 rad/s, of a car-like robot as it is described
     sensors        those of a common MEMS unit and of encoders on the motors
 
