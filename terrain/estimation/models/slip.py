@@ -79,7 +79,7 @@ from terrain.slip import MIN_SPEED_MPS, slip_ratio
 
 FAST_S, ACROSS_S = 0.5, 5.0
 """Over which d, and sideways speed of a robot that cannot drive sideways, are forgotten."""
-FAST_RATIO, FAST_PER_MPS2, FAST_TURNING = 0.005, 0.1, 0.06
+FAST_RATIO, FAST_PER_MPS2, FAST_TURNING = 0.01, 0.12, 0.06
 """Standard deviation of d in steady straight motion; what an acceleration of the wheels of 1 m/s^2, a tenth of the
 weight in traction, adds; and what turning on the spot does."""
 STEEPER_RATIO = 0.2
@@ -89,7 +89,7 @@ PULL_PER_MPS2, PULL_STD_PER_MPS2, PULL_WALK = 0.1, 0.1, 0.01
 YIELDING_RATIO = 0.3
 """Length over the radius of a wheel that it rolls from rest until the contact pulls: tyre and soil yield first, a track
 and a gear have slack; d is then of the order of 1."""
-FIRST_RATIO, SLOW_RATIO, SLOW_WALK = 0.5, 0.2, 0.012
+FIRST_RATIO, SLOW_RATIO, SLOW_WALK = 0.5, 0.2, 0.015
 """Of m at first, about 0, when it may be up to 1; that up to which it walks, and its walk in a second of driving."""
 TURN_WALK, GYRO_TURN_WALK, DIRECTION_RATIO = 0.02, 0.1, 0.1
 """Walk of chi within a second of turning, and that of a robot that skids beside a gyro, whose bias wheels that slip
@@ -101,7 +101,7 @@ LEAST_CHANGE = 0.03
 """Least change of slope and of how the wheels turn, in radians: what is less is noise, which would add up."""
 ACROSS_RATIO, ACROSS_M = 0.03, 0.05
 """Sideways speed over the speed of the wheels, and over the yaw rate: of a robot that skids, and in turns."""
-WHEEL_STD_MPS, LEAST_WHEEL_STD_MPS, REST_STD_MPS, GYRO_STD_RADPS, YAW_ACCEL = 0.01, 0.003, 0.001, 0.005, 1.0
+WHEEL_STD_MPS, LEAST_WHEEL_STD_MPS, REST_STD_MPS, GYRO_STD_RADPS, YAW_ACCEL = 0.01, 0.006, 0.001, 0.005, 1.0
 """Of a wheel's speed at first and at least, of the ground's below wheels that stand, and of a gyro's rate; walk of the
 yaw rate within a second."""
 APART_STDS = 2.0
