@@ -215,9 +215,13 @@ class StateTrack:
         for name in ("nis_dof", "use"):
             object.__setattr__(self, name, read_only(getattr(self, name), np.int8))
         object.__setattr__(self, "dropped", MappingProxyType(dict(self.dropped)))
-        shapes = {"mean": (n, d), "nis": (n, k), "nis_dof": (n, k), "use": (n, k)}
-        shapes["cov"] = (n, d) if self.cov.ndim == 2 else (n, d, d)
-        for name, shape in (shapes | {"reference_age_s": (n,)}).items():
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("nis", "nis_dof", "use"), (n, k))
+        shapes |= {
+            "mean": (n, d),
+            "cov": (n, d) if self.cov.ndim == 2 else (n, d, d),
+            "reference_age_s": (n,),
+        }
+        for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}, {shape} is needed")
 
