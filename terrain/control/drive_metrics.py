@@ -46,9 +46,8 @@ LOCKED_RATIO, LOCKED_ABOVE_MPS = 0.1, 0.1
 #: Turns are evaluated above the first, from the second after a change of the desired twist on, over the third at least.
 TURN_RADPS, TURN_AFTER_S, TURN_LEAST_S = 0.1, 1.5, 0.5
 #: Ground or motors give no more where the robot slips by more, the fastest wheel is commanded to nearly its limit (or a
-#: car's steering, at the speed that it has), a wheel is so much slower than its command, or the wheels of a robot that
-#: skids turn so many times faster than it does: on soft ground its yaw rate then hardly rises with theirs, and falls.
-LIMIT_SLIP_RATIO, LIMIT_SPEED_RATIO, LIMIT_BEHIND_RATIO, LIMIT_TURN_RATIO = 0.5, 0.98, 0.8, 3.2
+#: car's steering, at the speed that it has), or a wheel is so much slower than its command.
+LIMIT_SLIP_RATIO, LIMIT_SPEED_RATIO, LIMIT_BEHIND_RATIO = 0.5, 0.98, 0.8
 STANDING_MPS = 0.02  #: A robot that is slower than this stands.
 #: A robot is immobilised where it is slower than the first for this time while a speed above the last is desired.
 STUCK_MPS, STUCK_S, STUCK_COMMAND_MPS = 0.03, 2.0, 0.2
@@ -228,9 +227,6 @@ def turn_figures(run: RunLog, history: DriveHistory, robot: Robot, scenario: Sce
         limited = abs(np.nanmean(history.slip_ratio[within])) > LIMIT_SLIP_RATIO
         limited |= command.max() > LIMIT_SPEED_RATIO * fastest_mps_of(robot)
         limited |= (speed < LIMIT_BEHIND_RATIO * command - LOCKED_ABOVE_MPS / 2).any()
-        if robot.skids:
-            rolled = np.ptp(history.wheel_speed_mps[within].mean(axis=0)) / robot.track_m
-            limited |= rolled > LIMIT_TURN_RATIO * abs(yaw / passed_s)
         if isinstance(robot, BicycleRobot):
             most = math.tan(robot.steering_max_rad) / robot.wheelbase_m * history.speed_mps[within].mean()
             limited |= abs(twist[first, 2]) > LIMIT_SPEED_RATIO * most

@@ -129,18 +129,6 @@ def test_the_error_of_a_turn_counts_where_ground_and_motors_give_it(
     assert turn_figures(run, found, ROBOT, straight) == pytest.approx((math.nan, math.nan), nan_ok=True)
 
 
-@pytest.mark.parametrize(("yaw_rate", "figures"), [(0.27, (0.1, 0.0)), (0.1, (math.nan, 1.0))])
-def test_a_robot_that_hardly_turns_with_its_wheels_is_at_the_limit_of_its_ground(yaw_rate, figures):
-    husky, speeds = load_robot("husky"), np.tile([0.35, 0.65], (1000, 1))
-    scenario = from_legs("turn", "grass", [STAND, Leg(np.array([0.5, 0.0, 0.3]), 8.0)])
-    found = history(speed_x_mps=0.45, wheel_speed=0.5, yaw_rad=yaw_rate * time_of())._replace(
-        wheel_speed_mps=speeds
-    )
-    commands = Stream(time_of(), speeds / husky.wheel_radius_m, ("wheel_left_radps", "wheel_right_radps"))
-    run = RunLog("drive", "", {"commands": commands})
-    assert turn_figures(run, found, husky, scenario) == pytest.approx(figures, nan_ok=True)
-
-
 def test_peak_slip_is_the_mean_over_wheels_above_a_speed_and_ignores_single_samples():
     time_s = time_of()
     speed = np.where(time_s < 2, 0.1, 0.5)
