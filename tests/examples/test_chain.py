@@ -93,7 +93,7 @@ def test_a_stand_in_of_two_grounds_goes_through_the_whole_chain(script, tmp_path
 UNKNOWN = {
     "robotino": ("currents have no sign", "on another day"),
     "warthog": ("no motor currents", "mean over its scans"),
-    "husky": ("has a label", "currents have no sign", "times that of the wheels"),
+    "husky": ("has a label", "currents have no sign"),
     "marmotte": ("its publishers say so", "no motor currents", "no fastest speed"),
 }
 
