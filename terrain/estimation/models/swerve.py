@@ -440,5 +440,7 @@ def statuses(model: FilterModel, use: Array, z: Array, age_s: Array) -> Array:
         (ObserverStatus.STANDING, np.isfinite(z[:, REST_TWIST])),
         (ObserverStatus.PREDICTED, has_reference & (age_s > STALE_AFTER_S)),
     )
-    codes, conditions = zip(*cases, strict=True)
-    return np.select(conditions, list(map(int, codes)), int(ObserverStatus.OK))
+    codes = np.full(len(age_s), int(ObserverStatus.OK))
+    for code, where in reversed(cases):
+        codes[where] = code
+    return codes
