@@ -81,9 +81,8 @@ class Turning(NamedTuple):
     rolling: Array  #: (wheels, 3)
     skids: bool  #: whether its effective track is another than its track
     limit_mps: float  #: fastest speed of a wheel
-    arm_m: (
-        float  #: by which a change of the yaw rate changes the fastest wheel's speed; of a car its wheelbase
-    )
+    #: by which a change of the yaw rate changes the fastest wheel's speed; of a car its wheelbase
+    arm_m: float
 
 
 def turning_of(robot: Robot) -> Turning:

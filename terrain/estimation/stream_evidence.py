@@ -4,9 +4,9 @@ A speed over ground changes by what the accelerometer or the wheels show: what n
 shows of a sample's change is a jump; what the accelerometer does not is summed up.  Both are judged by what is
 usual while the robot moves, which its first seconds show.  Wheels are compared with each other, as the feed does:
 where all of them turn evenly, their rates may be rounded; but all that is measured of them, their currents, does
-not repeat.  Those of a robot that skids turn it as the gyro measures (:class:`Turns`).  Of what measures the motion
-over ground, and comes, none is gated but all, where the filter believes none of it.  A sensor of which nothing has
-come yet is not judged: what a robot does not have is not missed.
+not repeat.  Those of a robot that skids turn it as the gyro measures (:class:`TurnComparison`).  Of what measures the
+motion over ground, and comes, none is gated but all, where the filter believes none of it.  A sensor of which nothing
+has come yet is not judged: what a robot does not have is not missed.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class _Seen:
             self.jump, self.jump_per_s = signal.jump, signal.jump_per_s
 
 
-class Turns(NamedTuple):
+class TurnComparison(NamedTuple):
     """Gyro against the wheels of a robot that skids.
 
     They are apart by ``a = w - k (u_r - u_l) / B``, with the part k of the wheels' turn that is left by the filter.
@@ -119,14 +119,14 @@ class Turns(NamedTuple):
     known_s: float = 0.0
     apart_s: float = 0.0  #: for which they have been apart as they are not by nature
 
-    def after(self, gyro_radps: float, wheels_radps: float, dt_s: float) -> Turns:
+    def after(self, gyro_radps: float, wheels_radps: float, dt_s: float) -> TurnComparison:
         """Return what is known after a step; an unknown rate shows nothing."""
         apart = gyro_radps - wheels_radps
         if not math.isfinite(apart):
             return self
         if math.isnan(self.usual_radps) or self.apart_s > BELIEVED_S:
             usual = apart if abs(wheels_radps) < TURN_RADPS else 0.0  # tight turns show nothing of it
-            return Turns(np.full(2, apart), self.scatter_radps, usual, wheels_radps)
+            return TurnComparison(np.full(2, apart), self.scatter_radps, usual, wheels_radps)
         late, slow = (-math.expm1(-dt_s / time_s) for time_s in (FOLLOWS_S, USUAL_S))
         gap = np.clip(apart - self.apart_radps, -OUTLIER_RADPS, OUTLIER_RADPS)
         memories = self.apart_radps - np.expm1(-dt_s / np.array(TURNS_S)) * gap
@@ -137,11 +137,11 @@ class Turns(NamedTuple):
         turning = abs(wheels_radps - behind) + TURN_RATIO * both
         limit = np.maximum(TURN_JUMPS * self.scatter_radps, TURN_RADPS) + turning
         if (beyond > limit).any() or (self.apart_s and beyond[0] > 0.5 * limit[0]):
-            return Turns(memories, scatter, self.usual_radps, behind, known_s, self.apart_s + dt_s)
+            return TurnComparison(memories, scatter, self.usual_radps, behind, known_s, self.apart_s + dt_s)
         if turning > TURN_RADPS:
-            return Turns(memories, self.scatter_radps, self.usual_radps, behind, known_s)
+            return TurnComparison(memories, self.scatter_radps, self.usual_radps, behind, known_s)
         usual = self.usual_radps + max(slow, dt_s / known_s) * (float(memories[0]) - self.usual_radps)
-        return Turns(memories, scatter, usual, behind, known_s)
+        return TurnComparison(memories, scatter, usual, behind, known_s)
 
 
 class StreamEvidence:
@@ -179,7 +179,7 @@ class StreamEvidence:
         delays = {"gnss": "gnss_delay_s", **dict.fromkeys(("odometry", "lidar"), "pose_delay_s")}
         self._delays = {stream: states.index(name) for stream, name in delays.items() if name in states}
         self._delay_s = dict.fromkeys(self._delays, 0.0)
-        self._turns, self._track_m = Turns(), robot.track_m if robot.skids else math.nan
+        self._turns, self._track_m = TurnComparison(), robot.track_m if robot.skids else math.nan
         self._rates_radps: list[float] = []
         self._turn_loss = states.index("turn_loss_ratio") if "turn_loss_ratio" in states else None
         self._gained_mps = 0.0

@@ -71,10 +71,8 @@ MAX_STD_OF_FIX_M = 1.0
 #: Part of the speeds of steered wheels that no twist explains, from which, and over that of turned angles beyond which,
 #: the sign of the steering is turned: sound wheels that slip contradict each other by 0.02.
 CONTRADICTION, OVER_TURNED = 0.05, 3.0
-MIN_FORCE_MPS2, MOSTLY = (
-    0.3,
-    0.9,
-)  #: Ahead, beyond what an IMU that is mounted askew shows; part of the points
+#: Ahead, beyond what an IMU that is mounted askew shows; part of the points
+MIN_FORCE_MPS2, MOSTLY = 0.3, 0.9
 MIN_ACCELERATION_MPS2 = 0.15
 MIN_TILT_RATE_RADPS = 0.003  #: Means of a second; noise of both is less
 MIN_TILT_RAD = 0.02  #: Less is that of a floor, and of offsets.

@@ -25,6 +25,21 @@ from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 
 
+@pytest.fixture(scope="module")
+def browser():
+    """A headless browser; skips, by name, where there is none."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if chromium is None:
+        pytest.skip("chromium is not installed")
+    with playwright.sync_playwright() as started:
+        found = started.chromium.launch(
+            executable_path=chromium, args=["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
+        )
+        yield found
+        found.close()
+
+
 @pytest.fixture
 def terrain(monkeypatch, capfd):
     """Return a function that runs the command in this process: exit code, stdout and stderr."""

@@ -96,9 +96,9 @@ def test_uncertainty_of_wheel_speeds_is_by_default_the_robots_own_and_encoders_a
     count = np.floor(np.arange(0, 4, dt) * 5.0 / step)
     seen = lfilter([1 - np.exp(-dt / 0.05)], [1, -np.exp(-dt / 0.05)], np.diff(count) * step / dt)
     assert wheel_speed_std == pytest.approx(seen[5000:].std() * ROBOT.wheel_radius_m, rel=0.03)
-    nameless = wheel_slip(track, table, ROBOT.without("sensors"))
-    assert np.isnan(nameless.std).all()
-    np.testing.assert_allclose(nameless.mean, 0.2)
+    without_scatter = wheel_slip(track, table, ROBOT.without("sensors"))
+    assert np.isnan(without_scatter.std).all()
+    np.testing.assert_allclose(without_scatter.mean, 0.2)
     # a filter of encoders believes the wheels, at whatever speed the robot goes: a figure to show, and no slip
     track = make_track(np.tile([1.0, *[0.0] * 5], (5, 1)), WITHOUT, age_s=np.inf)
     table = make_table(track, 1.001)

@@ -174,18 +174,15 @@ _REFERENCES = (
     *("gnss_x_m", "gnss_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps"),
     *("pose_x_m", "pose_y_m", "pose_yaw_rad", "compass_rad", "camera_x_mps", "camera_y_mps"),
 )
-_DELAYS: tuple[
-    tuple[int, int, tuple[str, ...]], ...
-] = (  # row that begins to measure, state, names in a description
+# Row that begins to measure, state, names in a description.
+_DELAYS: tuple[tuple[int, int, tuple[str, ...]], ...] = (
     (0, _GNSS_DELAY, ("gnss_delay_s",)),
     (2, _GNSS_DELAY, ("gnss_delay_s",)),
     (4, _POSE_DELAY, ("pose_delay_s", "lidar_delay_s")),
     (8, _POSE_DELAY, ("odometry_delay_s", "lidar_delay_s")),
 )
-_OF_FIXES, _OF_POSES = (
-    [0, 1, 2, 3, 7],
-    [4, 5, 6],
-)  # places among them of satellites with a compass, and of poses
+# Places among the references of satellites with a compass, and of poses.
+_OF_FIXES, _OF_POSES = [0, 1, 2, 3, 7], [4, 5, 6]
 _AGE_ROWS = ("gnss_age_s", "pose_age_s", "camera_age_s")
 _INERTIAL = ("yaw_rate_radps", "accel_x_mps2", "pitch_rad")
 

@@ -6,7 +6,6 @@ import base64
 import json
 import math
 import re
-import shutil
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -131,11 +130,7 @@ def test_a_figure_gives_the_same_bytes_and_a_fragment_has_pictures_and_runs_noth
     assert figure_png(RECALL).startswith(b"\x89PNG")
 
 
-def test_a_legend_names_what_has_a_name_and_ends_with_no_colon(tmp_path):
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
-    if chromium is None:
-        pytest.skip("chromium is not installed")
+def test_a_legend_names_what_has_a_name_and_ends_with_no_colon(tmp_path, browser):
     marks = [
         Line("", [1, 2, 3], [0.1, 0.2, 0.3]),
         Points("held out", [1, 2], [1.0, 1.1], [0.9, 1.0], [1.1, 1.2]),
@@ -144,17 +139,15 @@ def test_a_legend_names_what_has_a_name_and_ends_with_no_colon(tmp_path):
     file = Report("Title", "Answer.", parts=[Figure("Curve", [panel], x_label="runs")]).save(
         tmp_path / "a.html"
     )
-    with playwright.sync_playwright() as started:
-        page = started.chromium.launch(
-            executable_path=chromium, args=["--no-sandbox", "--disable-gpu"]
-        ).new_page()
-        page.goto(file.as_uri())
-        rows = [row.inner_text().strip() for row in page.query_selector_all(".u-series") if row.is_visible()]
-        assert sorted(rows) == ["held out", "no correction"]
-        colon = "(row) => getComputedStyle(row, '::after').content"
-        assert {row.evaluate(colon) for row in page.query_selector_all(".u-series th")} == {"none"}
-        page.hover(".u-over")
-        assert page.query_selector(".u-series").is_visible()
+    page = browser.new_page()
+    page.goto(file.as_uri())
+    rows = [row.inner_text().strip() for row in page.query_selector_all(".u-series") if row.is_visible()]
+    assert sorted(rows) == ["held out", "no correction"]
+    colon = "(row) => getComputedStyle(row, '::after').content"
+    assert {row.evaluate(colon) for row in page.query_selector_all(".u-series th")} == {"none"}
+    page.hover(".u-over")
+    assert page.query_selector(".u-series").is_visible()
+    page.close()
 
 
 @pytest.mark.parametrize("marks", [YAW.panels[0].marks, RECALL.panels[0].marks])

@@ -1,6 +1,5 @@
 """The page in a real browser: what it shows, and that it goes on when robots and the service come and go."""
 
-import shutil
 import threading
 import time
 from contextlib import contextmanager
@@ -13,8 +12,6 @@ from pipelines.serve.client import TerrainClient
 from .strangers import CHANNELS, running
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 
 MOTORS = [f"motor_{i}_radps" for i in (1, 2, 3)] + [f"current_{i}_a" for i in (1, 2, 3)]
 SENT = {**CHANNELS, "wheels": [*CHANNELS["wheels"], *MOTORS]}
@@ -23,16 +20,6 @@ MARKUP = "<img src=x onerror=document.title='run'>"
 
 CHECKS = Path(__file__).with_name("page_checks.js")
 INK = "(canvas) => inkOf(canvas)"  #: Number of colours of a canvas
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with playwright.sync_playwright() as started:
-        found = started.chromium.launch(
-            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
-        )
-        yield found
-        found.close()
 
 
 @pytest.fixture

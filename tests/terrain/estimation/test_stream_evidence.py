@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from terrain.estimation.health import Health, HealthMonitor, sensors_of
-from terrain.estimation.stream_evidence import BELIEVED_S, StreamEvidence, Turns
+from terrain.estimation.stream_evidence import BELIEVED_S, StreamEvidence, TurnComparison
 from terrain.kinematics.logged_wheels import sensor_channels
 from terrain.records import Reading
 from terrain.robots import load_robot
@@ -240,7 +240,7 @@ def test_a_gyro_that_measures_no_rate_or_spikes_does_not_turn_otherwise_than_the
 
 def test_rough_ground_that_turns_the_robot_to_and_fro_is_no_fault_once_it_is_known():
     """A yaw rate of 0.05 rad/s, correlated over a tenth of a second, as a Husky has on sandy loam."""
-    turns, rng, rate, named = Turns(), np.random.default_rng(0), 0.0, []
+    turns, rng, rate, named = TurnComparison(), np.random.default_rng(0), 0.0, []
     for _ in range(3000):
         rate += -0.2 * rate + 0.03 * rng.standard_normal()
         turns = turns.after(rate, 0.01 * rng.standard_normal(), DT_S)
@@ -250,7 +250,7 @@ def test_rough_ground_that_turns_the_robot_to_and_fro_is_no_fault_once_it_is_kno
 
 @pytest.mark.parametrize("part", [0.8, 0.35])
 def test_a_robot_that_turns_later_than_its_wheels_and_by_less_is_no_fault(part):
-    turns, rng = Turns(), np.random.default_rng(0)
+    turns, rng = TurnComparison(), np.random.default_rng(0)
     turn = 0.0
     for k in range(600):
         wheels = 0.8 * (200 <= k < 400)
