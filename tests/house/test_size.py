@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MAX_LINES = {"terrain": 58_143, "features": 2_755, "pipelines": 20_177, "tests": 52_057}
+MAX_LINES = {"terrain": 58_137, "features": 2_755, "pipelines": 20_177, "tests": 52_052}
 """Lines of Python, docstrings included."""
 
 
